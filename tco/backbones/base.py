@@ -1,0 +1,41 @@
+"""What test-time optimisation needs from a multi-view network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol, runtime_checkable
+
+from torch import nn
+
+from tco.types import Prediction, Priors, Views
+
+
+@runtime_checkable
+class Backbone(Protocol):
+    """A multi-view network split into a frozen encoder and a decoder that adapters change.
+
+    ``encode`` runs once per chunk, without gradients. ``decode`` runs every step, differentiably,
+    for the views that a step needs. ``context`` is an earlier prediction for all views, which a
+    network may use for the views that it does not decode now; networks that have no use for it
+    ignore it.
+    """
+
+    name: str
+    stride: int
+    """Height and width of the canvas must be divisible by this."""
+    uses_cameras: bool
+    """True if the cameras are inputs and come back unchanged, False if they are predicted."""
+
+    def encode(self, views: Views, priors: Priors) -> Any:
+        """Features of all views that do not depend on the adapted weights."""
+        ...
+
+    def decode(
+        self, encoded: Any, views: Sequence[int] | None = None, context: Prediction | None = None
+    ) -> Prediction:
+        """Predict the given views of the chunk (all if None)."""
+        ...
+
+    def decoder(self) -> nn.Module:
+        """The module whose layers test-time adapters may change."""
+        ...
