@@ -12,13 +12,16 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_tco.atomic import atomic_file
 from colmap_tco.errors import InputError
+
+if TYPE_CHECKING:
+    from colmap_tco.views import Pinhole
 
 _LONGEST_HEADER = 64
 
@@ -70,6 +73,12 @@ def map_shape(path: str | os.PathLike[str]) -> tuple[int, int, int]:
     """
     with _open(path) as file:
         return _read_header(file, path)
+
+
+def map_intrinsics(camera: Pinhole, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """(fx, fy, cx, cy) of ``camera`` for a map of (H, W) ``shape``, which may be smaller than the image."""
+    sx, sy = shape[1] / camera.width, shape[0] / camera.height
+    return np.array([camera.fx * sx, camera.fy * sy, camera.cx * sx, camera.cy * sy], np.float64)
 
 
 def _open(path: str | os.PathLike[str]) -> BinaryIO:
