@@ -1,0 +1,264 @@
+"""The one place that knows pycolmap: its versions (3.11 to 4.2), its import order, its vague errors.
+
+pycolmap is loaded on first use, because the command line imports its neighbours for their settings.
+Nothing else in this package imports it.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import warnings
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_tco.errors import InputError
+
+Floats: TypeAlias = NDArray[np.float64]
+Ints: TypeAlias = NDArray[np.int64]
+Model: TypeAlias = Any
+"""A ``pycolmap.Reconstruction``."""
+Camera: TypeAlias = Any
+"""A ``pycolmap.Camera``."""
+
+MODEL_FILES = ("cameras", "images", "points3D")
+SPHERICAL = ("EQUIRECTANGULAR",)
+_QUIET, _TALKATIVE = 2, 0
+
+
+@cache
+def load() -> Any:
+    """The pycolmap module, imported after every other user of zlib and with its log kept to errors.
+
+    The wheels of 4.1.1 and later bring a zlib of their own. Whoever binds zlib's symbols after them
+    gets theirs, and PNG writing (Pillow, OpenCV), ``np.savez_compressed`` and gzip abort the process;
+    imported before, each keeps the zlib that it was built with.
+    """
+    import gzip  # noqa: F401
+    import zlib  # noqa: F401
+
+    import cv2  # noqa: F401
+    from PIL import Image
+
+    Image.init()  # loads the plug-ins, PNG among them
+
+    import pycolmap
+
+    pycolmap.logging.minloglevel = _QUIET
+    return pycolmap
+
+
+def version() -> tuple[int, int]:
+    """(major, minor) of the installed pycolmap."""
+    major, minor = load().__version__.split(".")[:2]
+    return int(major), int(minor)
+
+
+def set_verbose(verbose: bool) -> None:
+    """Let COLMAP's own log through to stderr, or only its errors."""
+    load().logging.minloglevel = _TALKATIVE if verbose else _QUIET
+
+
+def read_model(path: Path) -> Model:
+    """The reconstruction in a folder, binary or text.
+
+    Raises:
+        InputError: a file is missing, truncated, or not COLMAP's format.
+    """
+    suffix = ".bin" if (path / "cameras.bin").is_file() else ".txt"
+    missing = [name + suffix for name in MODEL_FILES if not (path / (name + suffix)).is_file()]
+    if missing:
+        raise InputError(f"{path}: {', '.join(missing)} missing; a COLMAP model needs all of {MODEL_FILES}")
+    try:
+        model = load().Reconstruction(str(path))
+    except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as error:
+        raise InputError(_broken(path, suffix, f"COLMAP's reader says: {error}")) from error
+    for camera in model.cameras.values():
+        if not _plausible(camera):
+            cause = f"camera {camera.camera_id} has no valid size or focal length"
+            raise InputError(_broken(path, suffix, cause))
+    if suffix == ".bin" and (path / "cameras.bin").stat().st_size < _cameras_size(model):
+        raise InputError(_broken(path, suffix, "cameras.bin is shorter than its own header says"))
+    return model
+
+
+def _broken(path: Path, suffix: str, cause: str) -> str:
+    files = [path / (name + suffix) for name in MODEL_FILES]
+    sizes = ", ".join(f"{file.name} {file.stat().st_size} bytes" for file in files)
+    return (
+        f"{path}: not readable as a COLMAP model, probably a truncated or interrupted copy "
+        f"({cause}; {sizes}). Copy or export the model again."
+    )
+
+
+def _plausible(camera: Camera) -> bool:
+    params = np.asarray(camera.params, float)
+    return bool(camera.width > 0 and camera.height > 0 and np.isfinite(params).all() and params[0] > 0) or (
+        is_spherical(camera)
+    )
+
+
+def _cameras_size(model: Model) -> int:
+    """Bytes of a complete cameras.bin: a count, then id, model, width, height and parameters."""
+    return 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
+
+
+def is_spherical(camera: Camera) -> bool:
+    """Whether the camera covers directions that no single pinhole can (its focal length does not exist)."""
+    return str(camera.model.name) in SPHERICAL
+
+
+def camera_size(camera: Camera) -> tuple[int, int]:
+    """(width, height) in pixels."""
+    return int(camera.width), int(camera.height)
+
+
+def focal_lengths(camera: Camera) -> tuple[float, float]:
+    """(fx, fy) in pixels; not defined for spherical cameras, where pycolmap 4.2 crashes if asked."""
+    return float(camera.focal_length_x), float(camera.focal_length_y)
+
+
+def img_from_cam(camera: Camera, xy: Floats) -> Floats:
+    """Pixels (N, 2) of normalised camera coordinates (N, 2), that is x / z and y / z."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        pixels = camera.img_from_cam(np.concatenate([xy, np.ones((len(xy), 1))], 1))
+    return np.asarray(pixels, float).reshape(-1, 2)
+
+
+def cam_from_img(camera: Camera, pixels: Floats, tolerance: float = 0.01) -> Floats:
+    """Normalised camera coordinates (N, 2) of pixels (N, 2); NaN where the model has no inverse.
+
+    COLMAP's iteration can leave a wrong value beyond the radius at which a polynomial folds back, and
+    fisheye rays at 90° or more come out mirrored: what does not project back within ``tolerance``
+    pixels is not accepted.
+    """
+    pixels = np.ascontiguousarray(pixels, float).reshape(-1, 2)
+    xy = np.asarray(camera.cam_from_img(pixels), float).reshape(-1, 2)
+    back = img_from_cam(camera, np.where(np.isfinite(xy), xy, 0.0))
+    with np.errstate(invalid="ignore"):
+        wrong = ~(np.abs(back - pixels).max(1) <= tolerance)
+    xy[wrong | ~np.isfinite(xy).all(1)] = np.nan
+    return xy
+
+
+@dataclass(frozen=True)
+class Registered:
+    """One registered image of a model.
+
+    Attributes:
+        image_id: COLMAP's id.
+        name: path relative to the image folder, with forward slashes.
+        camera: its ``pycolmap.Camera``.
+        cam_from_world: (3, 4) float64.
+    """
+
+    image_id: int
+    name: str
+    camera: Camera
+    cam_from_world: Floats
+
+
+def registered(model: Model) -> list[Registered]:
+    """The images that have a pose, ordered by name."""
+    found = []
+    for image in model.images.values():
+        if image.has_pose:
+            pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
+            camera = model.cameras[image.camera_id]
+            found.append(Registered(int(image.image_id), image.name, camera, np.array(pose.matrix(), float)))
+    return sorted(found, key=lambda entry: entry.name)
+
+
+def observations(model: Model, image_id: int) -> tuple[Floats, Ints]:
+    """Keypoints (N, 2) of one image that belong to a 3D point, and the ids (N,) of those points."""
+    points = model.images[image_id].get_observation_points2D()
+    xy = np.array([point.xy for point in points], float).reshape(-1, 2)
+    return xy, np.array([point.point3D_id for point in points], np.int64)
+
+
+def points(model: Model) -> tuple[Ints, Floats, NDArray[np.uint8]]:
+    """Ids (P,), world positions (P, 3) and RGB colours (P, 3) of the 3D points, ordered by id."""
+    entries = sorted(model.points3D.items())
+    ids = np.array([key for key, _ in entries], np.int64)
+    xyz = np.array([point.xyz for _, point in entries], float).reshape(-1, 3)
+    rgb = np.array([point.color for _, point in entries], np.uint8).reshape(-1, 3)
+    return ids, xyz, rgb
+
+
+@dataclass(frozen=True)
+class PinholeImage:
+    """One image of a model to be written by :func:`pinhole_model`.
+
+    Attributes:
+        entry: id, name and pose.
+        camera: width, height, fx, fy, cx, cy.
+        xy: (N, 2) keypoints in that camera.
+        points: (N,) the ids of their 3D points.
+    """
+
+    entry: Registered
+    camera: tuple[int, int, float, float, float, float]
+    xy: Floats
+    points: Ints
+
+
+def pinhole_model(images: list[PinholeImage], cloud: tuple[Ints, Floats, NDArray[np.uint8]]) -> Model:
+    """A reconstruction with PINHOLE cameras alone; ids, names and poses as given.
+
+    It goes through COLMAP's text format (``scene/reconstruction_io_text.cc``), which every version
+    reads, so that rigs and frames are made by the version that wants them. Equal cameras are shared.
+
+    Args:
+        images: the images to keep.
+        cloud: as :func:`points` gives it; points that fewer than two of the images see are left out.
+    """
+    seen: dict[int, list[tuple[int, int]]] = {}
+    for image in images:
+        for index, point in enumerate(image.points.tolist()):
+            seen.setdefault(point, []).append((image.entry.image_id, index))
+    tracks = {point: track for point, track in seen.items() if len({i for i, _ in track}) > 1}
+    cameras = {camera: i for i, camera in enumerate(dict.fromkeys(image.camera for image in images), 1)}
+    with tempfile.TemporaryDirectory(prefix="colmap-tco-") as folder:
+        lines = [f"{i} PINHOLE {_row(camera)}" for camera, i in cameras.items()]
+        _write_lines(folder, "cameras.txt", lines)
+        _write_lines(folder, "images.txt", [_image_lines(i, cameras[i.camera], tracks) for i in images])
+        _write_lines(folder, "points3D.txt", _point_lines(cloud, tracks))
+        model = load().Reconstruction(folder)
+    model.update_point_3d_errors()
+    return model
+
+
+def _write_lines(folder: str, name: str, lines: Iterable[str]) -> None:
+    with open(os.path.join(folder, name), "w", encoding="utf-8") as file:
+        file.writelines(line + "\n" for line in lines)
+
+
+def _row(values: Iterable[float]) -> str:
+    """Numbers with all their digits."""
+    return " ".join(map(repr, values))
+
+
+def _image_lines(image: PinholeImage, camera_id: int, kept: Mapping[int, object]) -> str:
+    entry = image.entry
+    rotation = load().Rotation3d(np.ascontiguousarray(entry.cam_from_world[:, :3]))
+    x, y, z, w = np.asarray(rotation.quat, float).tolist()
+    pose = _row([w, x, y, z, *entry.cam_from_world[:, 3].tolist()])
+    owners = [point if point in kept else -1 for point in image.points.tolist()]
+    keypoints = " ".join(f"{_row(xy)} {owner}" for xy, owner in zip(image.xy.tolist(), owners, strict=True))
+    return f"{entry.image_id} {pose} {camera_id} {entry.name}\n{keypoints}"
+
+
+def _point_lines(
+    cloud: tuple[Ints, Floats, NDArray[np.uint8]], tracks: Mapping[int, list[tuple[int, int]]]
+) -> Iterable[str]:
+    for point, xyz, rgb in zip(*(part.tolist() for part in cloud), strict=True):
+        if point in tracks:
+            track = " ".join(f"{image} {index}" for image, index in tracks[point])
+            yield f"{point} {_row(xyz)} {_row(rgb)} 0 {track}"
