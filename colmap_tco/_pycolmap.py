@@ -22,6 +22,7 @@ from colmap_tco.errors import InputError
 
 Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
+Mask: TypeAlias = NDArray[np.bool_]
 Model: TypeAlias = Any
 """A ``pycolmap.Reconstruction``."""
 Camera: TypeAlias = Any
