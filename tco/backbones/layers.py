@@ -1,0 +1,121 @@
+"""Building blocks of the embedded network: convolutions, residuals and a transformer with 2-D rotary positions."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+class Conv(nn.Module):
+    """Convolution in two or three dimensions, group normalisation, ReLU."""
+
+    def __init__(self, dims: int, cin: int, cout: int, kernel: int = 3, stride: int = 1, dilation: int = 1) -> None:
+        super().__init__()
+        kind = nn.Conv2d if dims == 2 else nn.Conv3d
+        self.conv = kind(cin, cout, kernel, stride, dilation * (kernel // 2), dilation, bias=False)
+        self.norm = nn.GroupNorm(max(1, cout // 8), cout)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, cin, …) → (B, cout, … / stride)."""
+        return F.relu(self.norm(self.conv(x)), inplace=True)
+
+
+class Pointwise(nn.Linear):
+    """A 1×1 convolution over maps or volumes, as one matrix product (many times faster on a CPU)."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, cin, …) → (B, cout, …)."""
+        y = self.weight @ x.flatten(2)
+        if self.bias is not None:
+            y = y + self.bias.unsqueeze(-1)
+        return y.unflatten(2, x.shape[2:])
+
+
+class Residual(nn.Module):
+    """Two convolutions added to their input."""
+
+    def __init__(self, dims: int, channels: int, dilation: int = 1) -> None:
+        super().__init__()
+        self.a = Conv(dims, channels, channels, dilation=dilation)
+        kind = nn.Conv2d if dims == 2 else nn.Conv3d
+        self.b = kind(channels, channels, 3, padding=1)
+        nn.init.zeros_(self.b.weight)
+        nn.init.zeros_(self.b.bias)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Shape is kept."""
+        return x + self.b(self.a(x))
+
+
+def rotary(height: int, width: int, channels: int, like: Tensor, base: float = 100.0) -> tuple[Tensor, Tensor]:
+    """Cosines and sines (H·W, channels) of 2-D rotary positions: half of the channels for y, half for x."""
+    quarter = channels // 4
+    freq = base ** -(torch.arange(quarter, device=like.device, dtype=like.dtype) / quarter)
+    y, x = torch.meshgrid(
+        torch.arange(height, device=like.device, dtype=like.dtype),
+        torch.arange(width, device=like.device, dtype=like.dtype),
+        indexing="ij",
+    )
+    angle = torch.cat([y.reshape(-1, 1) * freq, x.reshape(-1, 1) * freq], -1)
+    angle = torch.cat([angle, angle], -1)
+    return angle.cos(), angle.sin()
+
+
+def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
+    """Turn (…, N, C) by the angles of :func:`rotary`."""
+    a, b = x.chunk(2, -1)
+    return x * cos + torch.cat([-b, a], -1) * sin
+
+
+class Block(nn.Module):
+    """Pre-norm transformer block with rotary self-attention; names as in the published MVTs."""
+
+    def __init__(self, channels: int, heads: int, ratio: int = 2) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm1, self.norm2 = nn.LayerNorm(channels), nn.LayerNorm(channels)
+        self.qkv, self.proj = nn.Linear(channels, 3 * channels), nn.Linear(channels, channels)
+        self.fc1, self.fc2 = nn.Linear(channels, ratio * channels), nn.Linear(ratio * channels, channels)
+
+    def forward(self, x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
+        """Tokens (B, N, C) → (B, N, C)."""
+        b, n, c = x.shape
+        q, k, v = self.qkv(self.norm1(x)).reshape(b, n, 3, self.heads, c // self.heads).permute(2, 0, 3, 1, 4)
+        y = F.scaled_dot_product_attention(rotate(q, cos, sin), rotate(k, cos, sin), v)
+        x = x + self.proj(y.transpose(1, 2).reshape(b, n, c))
+        return x + self.fc2(F.gelu(self.fc1(self.norm2(x))))
+
+
+class FeatureNet(nn.Module):
+    """Image pyramid: matching features at 1/4 and 1/2, context at 1/2 and 1/16.
+
+    Colours are whitened per view first, so that exposure and white balance change nothing.
+    """
+
+    def __init__(self, coarse: int, fine: int, context: int) -> None:
+        super().__init__()
+        self.stem = nn.Sequential(Conv(2, 3, 24, 5, stride=2), Conv(2, 24, 24))
+        self.down4 = nn.Sequential(Conv(2, 24, 48, stride=2), Residual(2, 48), Residual(2, 48))
+        self.down8 = nn.Sequential(Conv(2, 48, 64, stride=2), Residual(2, 64), Residual(2, 64))
+        self.down16 = nn.Sequential(Conv(2, 64, 96, stride=2), Residual(2, 96), Residual(2, 96))
+        self.up8, self.up4, self.up2 = (nn.Conv2d(a, b, 1) for a, b in ((96, 64), (64, 48), (48, 24)))
+        self.out8, self.out4, self.out2 = Conv(2, 64, 64), Conv(2, 48, 48), Conv(2, 24, 24)
+        self.coarse, self.fine = nn.Conv2d(48, coarse, 1), nn.Conv2d(24, fine, 1)
+        self.context = nn.Conv2d(24, context, 1)
+
+    def forward(self, images: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Images (V, 3, H, W), valid (V, H, W) → coarse (V, ·, H/4, W/4), fine and context at H/2, top at H/16."""
+        weight = valid.unsqueeze(1).to(images.dtype)
+        total = weight.sum((2, 3), keepdim=True).clamp_min(1)
+        mean = (images * weight).sum((2, 3), keepdim=True) / total
+        var = ((images - mean) ** 2 * weight).sum((2, 3), keepdim=True) / total
+        x = (images - mean) / (var + 1e-3).sqrt() * weight
+        x2 = self.stem(x)
+        x4 = self.down4(x2)
+        x8 = self.down8(x4)
+        x16 = self.down16(x8)
+        y8 = self.out8(x8 + F.interpolate(self.up8(x16), scale_factor=2.0, mode="bilinear"))
+        y4 = self.out4(x4 + F.interpolate(self.up4(y8), scale_factor=2.0, mode="bilinear"))
+        y2 = self.out2(x2 + F.interpolate(self.up2(y4), scale_factor=2.0, mode="bilinear"))
+        return self.coarse(y4), self.fine(y2), self.context(y2), x16

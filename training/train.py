@@ -1,0 +1,233 @@
+"""Train the embedded network on rendered samples; stops and resumes at any time.
+
+``python -m training.train --data runs/data --out runs/sweep`` writes ``state.pt`` (everything, to
+resume), ``weights.safetensors`` (moving average, what the package ships) and ``log.csv``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import csv
+import json
+import logging
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from safetensors.torch import save_file
+from torch import Tensor
+
+from tco.backbones.sweep import Encoded, Stage, Sweep, _detached, _doubled, _stack
+from training.dataset import load
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything that decides the result.
+
+    Attributes:
+        steps: length of the cosine schedule. rate: peak learning rate. warmup: steps to reach it.
+        sizes: (share of the steps after which it starts, H, W) of the samples.
+        refined: views a step whose refinement is trained; all views train the coarse stage.
+        average: decay of the moving average of the weights.
+        held_out: samples with the lowest numbers, kept for validation.
+    """
+
+    steps: int = 6000
+    rate: float = 1e-3
+    warmup: int = 150
+    sizes: tuple[tuple[float, int, int], ...] = ((0.0, 96, 128), (0.85, 144, 192))
+    refined: int = 3
+    average: float = 0.995
+    held_out: int = 24
+    seed: int = 0
+
+
+def pooled(depth: Tensor, factor: int) -> Tensor:
+    """Inverse depth (V, h, w), 0 where unknown: the mean where the surface is smooth, else one pixel's."""
+    inverse = torch.where(depth > 0, 1 / depth.clamp_min(1e-6), torch.zeros_like(depth)).unsqueeze(1)
+    mean = F.avg_pool2d(inverse, factor).squeeze(1)
+    top, low = F.max_pool2d(inverse, factor).squeeze(1), -F.max_pool2d(-inverse, factor).squeeze(1)
+    middle = inverse[:, 0, factor // 2 :: factor, factor // 2 :: factor]
+    return torch.where(top < 1.08 * low, mean, middle)
+
+
+def coarse_loss(stage: Stage, encoded: Encoded, truth: Tensor) -> Tensor:
+    """Cross-entropy over planes, linear between the two nearest, and a clipped L1 on the index."""
+    assert stage.scores is not None
+    lo, step = encoded.lo.view(-1, 1, 1), encoded.step.view(-1, 1, 1)
+    planes = stage.scores.shape[1]
+    index = (truth - lo) / step
+    known = (truth > 0) & (index > 0) & (index < planes - 1)
+    index = index.clamp(0, planes - 1.001)
+    below = index.floor().long()
+    part = index - below
+    logp = stage.scores.log_softmax(1)
+    entropy = -(1 - part) * logp.gather(1, below.unsqueeze(1)).squeeze(1)
+    entropy = entropy - part * logp.gather(1, below.unsqueeze(1) + 1).squeeze(1)
+    off = ((stage.inverse - lo) / step - index).abs().clamp_max(4)
+    return ((entropy + 0.3 * off) * known).sum() / known.sum().clamp_min(1)
+
+
+def fine_loss(stage: Stage, truth: Tensor) -> Tensor:
+    """Laplace likelihood of the relative error and a clipped relative L1."""
+    known = truth > 0
+    error = (stage.inverse / truth.clamp_min(1e-6) - 1).abs()
+    log_b = stage.log_error.clamp(math.log(3e-3), 0.0)
+    likelihood = error.clamp_max(0.5) * (-log_b).exp() + log_b
+    return ((likelihood + 8 * error.clamp_max(0.25)) * known).sum() / known.sum().clamp_min(1)
+
+
+def losses(net: Sweep, sample: tuple, refined: list[int], sources: int) -> tuple[Tensor, dict[str, float]]:
+    """Total loss of one sample, and figures for the log."""
+    views, priors, depth = sample
+    encoded = net.encode(views, priors, sources)
+    first = net.coarse(encoded, range(len(views)))
+    total = coarse_loss(first, encoded, pooled(depth, 4))
+    world = _detached(_doubled(first))
+    each = {v: Stage(first.inverse[v : v + 1], first.log_error[v : v + 1]) for v in refined}
+    figures = {"coarse": float(total.detach())}
+    for k in range(len(net.config.spacing)):
+        each = {v: net.refine(k, encoded, v, s, world) for v, s in each.items()}
+        stage = _stack(list(each.values()))
+        last = k + 1 == len(net.config.spacing)
+        truth = pooled(depth[refined], 1 if last else 2)
+        term = fine_loss(stage, truth)
+        total = total + (1.0 if last else 0.5) * term
+        if not last:
+            inverse, error = world.inverse.clone(), world.log_error.clone()
+            inverse[refined], error[refined] = stage.inverse.detach(), stage.log_error.detach()
+            world = Stage(inverse, error)
+    known = truth > 0
+    off = (stage.inverse / truth.clamp_min(1e-6) - 1).abs()[known]
+    figures.update(fine=float(term.detach()), d2=float((off < 0.02).float().mean()), d5=float((off < 0.05).float().mean()))
+    return total, figures
+
+
+class Trainer:
+    """Network, its moving average, optimiser and step count; saved and restored as one file."""
+
+    def __init__(self, config: TrainConfig, data: Path, out: Path) -> None:
+        self.config, self.data, self.out = config, data, out
+        torch.manual_seed(config.seed)
+        self.net = Sweep()
+        self.mean = copy.deepcopy(self.net).eval()
+        self.optimiser = torch.optim.AdamW(self.net.parameters(), config.rate, weight_decay=1e-4)
+        self.step = 0
+        out.mkdir(parents=True, exist_ok=True)
+        if (out / "state.pt").exists():
+            state = torch.load(out / "state.pt", weights_only=True)
+            self.net.load_state_dict(state["net"])
+            self.mean.load_state_dict(state["mean"])
+            self.optimiser.load_state_dict(state["optimiser"])
+            self.step = int(state["step"])
+            logger.info("resumed at step %d", self.step)
+
+    def save(self) -> None:
+        """Write the state and the averaged weights, atomically."""
+        state = {
+            "net": self.net.state_dict(), "mean": self.mean.state_dict(),
+            "optimiser": self.optimiser.state_dict(), "step": self.step,
+        }  # fmt: skip
+        torch.save(state, self.out / "state.part")
+        (self.out / "state.part").replace(self.out / "state.pt")
+        info = {"config": json.dumps(self.mean.metadata()), "steps": str(self.step)}
+        save_file(self.mean.state_dict(), self.out / "weights.part", info)
+        (self.out / "weights.part").replace(self.out / "weights.safetensors")
+
+    def rate(self) -> float:
+        """Cosine from the peak to a fiftieth of it, after a linear warm-up."""
+        c = self.config
+        t = min(1.0, self.step / c.steps)
+        return c.rate * min(1.0, (self.step + 1) / c.warmup) * (0.02 + 0.98 * (0.5 + 0.5 * math.cos(math.pi * t)))
+
+    def one(self) -> dict[str, float] | None:
+        """One optimisation step; None if the sample could not be used."""
+        c = self.config
+        rng = np.random.default_rng((c.seed, self.step))
+        files = sorted(self.data.glob("*.npz"))[c.held_out :]
+        _, h, w = [s for s in c.sizes if s[0] * c.steps <= self.step][-1]
+        sample = load(files[rng.integers(len(files))], int(rng.integers(2**31)), (h, w))
+        if sample is None:
+            return None
+        refined = sorted(rng.choice(len(sample[0]), c.refined, replace=False).tolist())
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.rate()
+        self.optimiser.zero_grad(set_to_none=True)
+        loss, figures = losses(self.net, sample, refined, int(rng.integers(2, 6)))
+        loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.net.parameters(), 2.0)
+        if not torch.isfinite(norm):
+            logger.warning("step %d: gradient is not finite, skipped", self.step)
+            return None
+        self.optimiser.step()
+        decay = min(c.average, (self.step + 1) / (self.step + 10))
+        with torch.no_grad():
+            for a, b in zip(self.mean.parameters(), self.net.parameters(), strict=True):
+                a.lerp_(b, 1 - decay)
+        return figures
+
+    @torch.no_grad()
+    def validate(self) -> dict[str, float]:
+        """Mean figures of the averaged weights on the held-out samples."""
+        rows = []
+        for path in sorted(self.data.glob("*.npz"))[: self.config.held_out]:
+            sample = load(path, 7, (96, 128))
+            if sample is not None:
+                rows.append(losses(self.mean, sample, [0, 3], 5)[1])
+        return {k: float(np.mean([r[k] for r in rows])) for k in rows[0]}
+
+    def run(self, every: int = 100, validation: int = 500) -> None:
+        """Train to the end of the schedule."""
+        rows: list[dict[str, float]] = []
+        start = time.monotonic()
+        while self.step < self.config.steps:
+            figures = self.one()
+            self.step += 1
+            if figures is not None:
+                rows.append(figures)
+            if self.step % every == 0 and rows:
+                means = {k: float(np.mean([r[k] for r in rows])) for k in rows[0]}
+                self.log("train", means, (time.monotonic() - start) / every)
+                rows, start = [], time.monotonic()
+                self.save()
+            if self.step % validation == 0:
+                self.log("valid", self.validate(), 0.0)
+                start = time.monotonic()
+        self.save()
+
+    def log(self, kind: str, figures: dict[str, float], seconds: float) -> None:
+        """Append a line to log.csv and to the log."""
+        path = self.out / "log.csv"
+        fresh = not path.exists()
+        with path.open("a", newline="") as f:
+            writer = csv.writer(f)
+            if fresh:
+                writer.writerow(["step", "kind", *figures, "seconds"])
+            writer.writerow([self.step, kind, *(f"{x:.4f}" for x in figures.values()), f"{seconds:.3f}"])
+        text = " ".join(f"{k} {v:.3f}" for k, v in figures.items())
+        logger.info("%d %s %s (%.2f s a step)", self.step, kind, text, seconds)
+
+
+def main() -> None:
+    """Command line of the trainer."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--steps", type=int, default=TrainConfig.steps)
+    parser.add_argument("--threads", type=int, default=2)
+    args = parser.parse_args()
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+    torch.set_num_threads(args.threads)
+    Trainer(TrainConfig(steps=args.steps), args.data, args.out).run()
+
+
+if __name__ == "__main__":
+    main()
