@@ -116,3 +116,34 @@ def sample(maps: Tensor, xy: Tensor, mode: str = "bilinear") -> Tensor:
         maps, grid.unsqueeze(2), mode=mode, padding_mode="zeros", align_corners=False
     )
     return values.squeeze(-1)
+
+
+def matrix_from_quat(q: Tensor) -> Tensor:
+    """Rotation matrices (…, 3, 3) of quaternions (…, 4) in the order w, x, y, z, of any length but zero."""
+    w, x, y, z = torch.nn.functional.normalize(q, dim=-1).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, -1).reshape(*q.shape[:-1], 3, 3)
+
+
+def quat_from_matrix(R: Tensor) -> Tensor:
+    """Unit quaternions (…, 4) in the order w, x, y, z of rotation matrices (…, 3, 3).
+
+    The entries of R give each product 4 qᵢ qⱼ; row i of that matrix is q up to its length. The row
+    with the largest diagonal (at least 1) is normalised, so no square root comes near zero and the
+    derivative is finite for every rotation. The sign is the one that makes that row's entry positive.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in R.unbind(-2))
+    products = [
+        1 + a + e + i, h - f, c - g, d - b,
+        h - f, 1 + a - e - i, b + d, c + g,
+        c - g, b + d, 1 - a + e - i, f + h,
+        d - b, c + g, f + h, 1 - a - e + i,
+    ]  # fmt: skip
+    table = torch.stack(products, -1).reshape(*R.shape[:-2], 4, 4)
+    best = table.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    row = table.gather(-2, best[..., None, None].expand(*best.shape, 1, 4)).squeeze(-2)
+    return torch.nn.functional.normalize(row, dim=-1)

@@ -3,12 +3,13 @@
 An adapted layer computes ``W x + (alpha / rank) · B A x`` with its frozen W, a random A that maps to
 ``rank`` channels and a B that starts at zero, so that the output is unchanged at first.
 
-A linear layer gets the low-rank branch as a forward hook: its backward pass needs no gradient of the
-shape of W, which costs as much as the layer itself (measured: 15 % more time than the frozen layer,
-against 45 % for adding B A to W). A convolution gets B A added to its weight on the way to the
-kernel, because a convolution to few channels is slow for its size (28 % more time, against 150 % for
-a branch of its own). Neither replaces a layer or a parameter: structure, names and state dict are the
-same even inside the block, and leaving it removes what was hooked in.
+A linear layer gets the low-rank branch as a forward hook: its backward pass then needs no gradient of
+the shape of W, which costs as much as the layer itself (384 → 1536 channels, forward and backward on
+one core: 20 % more time than the frozen layer, against 49 % for adding B A to W). A convolution gets
+B A added to its weight on the way to the kernel, because a convolution to few channels is slow for its
+size (3×3×3, 16 channels: 2.1 times the frozen layer, against 3.0 for a branch). Neither replaces a
+layer or a parameter: structure, names and state dict are the same even inside the block, and leaving
+it removes what was hooked in.
 """
 
 from __future__ import annotations
