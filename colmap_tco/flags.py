@@ -133,7 +133,8 @@ def add_flags(parser: argparse.ArgumentParser, config_type: type) -> None:
     for setting in settings(config_type):
         if setting.owner not in groups:
             groups[setting.owner] = parser.add_argument_group(_title(setting.owner))
-        text = f"{setting.help} (default: {setting.show(setting.default)})".replace("%", "%%")
+        default = setting.show(setting.default) or "empty"
+        text = f"{setting.help} (default: {default})".replace("%", "%%")
         if setting.base is bool:
             groups[setting.owner].add_argument(
                 *setting.flags, dest=setting.name, action=_Switch, nargs=0, default=setting.default, help=text

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Optional
@@ -150,10 +151,11 @@ def test_help_shows_what_each_setting_does_and_its_default() -> None:
     parser = argparse.ArgumentParser(formatter_class=lambda prog: argparse.HelpFormatter(prog, width=200))
     flags.add_flags(parser, Outer)
     text = parser.format_help()
-    assert "weight of the term, 100 % at 1 (default: 1.5)" in text
+    assert re.search(r"--weight X +weight of the term, 100 % at 1 \(default: 1\.5\)\n", text)
     assert "--resume, --no_resume" in text
     assert "continue (default: on)" in text
     assert "masks (default: none)" in text
+    assert "sizes in pixels (default: empty)" in text
     assert "{qkv,proj,fc1},…" in text
     for title in ("The whole:", "Penalties. And a second sentence:", "Middle:"):
         assert f"\n{title}\n" in text

@@ -161,7 +161,20 @@ def test_ci_sets_up_lints_and_tests_in_this_order(checkout: Path) -> None:
     assert places == sorted(places)
 
 
-def test_ci_stops_at_the_first_failure(checkout: Path) -> None:
-    done = ci(checkout, PYTHON="false")
-    assert done.returncode != 0
-    assert "pytest" not in done.stdout
+@pytest.mark.parametrize(
+    ("broken", "ran"),
+    [(None, ["ruff check", "ruff format", "mypy", "pytest"]), ("ruff", ["ruff check"]), ("python", None)],
+)
+def test_ci_stops_at_the_first_failure(checkout: Path, broken: str | None, ran: list[str] | None) -> None:
+    """With an installed environment whose programs do nothing but succeed, or fail where broken."""
+    commands = checkout / ".venv/bin"
+    commands.mkdir(parents=True)
+    for name in ("ruff", "mypy", "python"):
+        (commands / name).symlink_to(str(shutil.which("false" if name == broken else "true")))
+    (checkout / ".venv/.installed").touch()
+    done = ci(checkout)
+    started = re.findall(
+        r"^\.venv/bin/(?:python -m )?(ruff check|ruff format|mypy|pytest)", done.stdout, re.MULTILINE
+    )
+    assert started == (ran or ["ruff check", "ruff format", "mypy", "pytest"])
+    assert (done.returncode == 0) is (broken is None)
