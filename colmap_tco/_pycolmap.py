@@ -263,3 +263,90 @@ def _point_lines(
         if point in tracks:
             track = " ".join(f"{image} {index}" for image, index in tracks[point])
             yield f"{point} {_row(xyz)} {_row(rgb)} 0 {track}"
+
+
+def extract_features(
+    database: Path, folder: Path, names: list[str], share_camera: bool, threads: int, seed: int
+) -> None:
+    """Add SIFT features of the named images to a database, with one new camera for all or one for each."""
+    pycolmap = load()
+    pycolmap.set_random_seed(seed)
+    kind, key = (
+        ("FeatureExtractionOptions", "extraction_options")
+        if hasattr(pycolmap, "FeatureExtractionOptions")
+        else ("SiftExtractionOptions", "sift_options")
+    )
+    options = getattr(pycolmap, kind)()
+    options.num_threads = threads
+    key_names = "image_names" if version() >= (3, 12) else "image_list"
+    mode = pycolmap.CameraMode.SINGLE if share_camera else pycolmap.CameraMode.PER_IMAGE
+    arguments = {key_names: names, "camera_mode": mode, key: options}
+    pycolmap.extract_features(str(database), str(folder), **arguments)
+
+
+def match(database: Path, threads: int, seed: int, overlap: int | None = None) -> None:
+    """Match and verify all pairs, or those at most ``overlap`` (and powers of two) apart in name order."""
+    pycolmap = load()
+    if overlap is None:
+        pycolmap.match_exhaustive(str(database), **_matching(threads, seed))
+        return
+    modern = hasattr(pycolmap, "SequentialPairingOptions")
+    pairing = pycolmap.SequentialPairingOptions() if modern else pycolmap.SequentialMatchingOptions()
+    pairing.overlap = overlap
+    key = "pairing_options" if modern else "matching_options"
+    pycolmap.match_sequential(str(database), **_matching(threads, seed), **{key: pairing})
+
+
+def can_match_pairs() -> bool:
+    """Whether this pycolmap can match a list of pairs (from 4.0)."""
+    return hasattr(load(), "match_image_pairs")
+
+
+def match_pairs(database: Path, pair_list: Path, threads: int, seed: int) -> None:
+    """Match and verify the pairs in a text file, two names a line."""
+    pairing = load().ImportedPairingOptions()
+    pairing.match_list_path = str(pair_list)
+    load().match_image_pairs(str(database), pairing_options=pairing, **_matching(threads, seed))
+
+
+def _matching(threads: int, seed: int) -> dict[str, Any]:
+    """Matching and verification options under the names of this version, seeded where it can be."""
+    pycolmap = load()
+    pycolmap.set_random_seed(seed)
+    modern = hasattr(pycolmap, "FeatureMatchingOptions")
+    options = pycolmap.FeatureMatchingOptions() if modern else pycolmap.SiftMatchingOptions()
+    options.num_threads = threads
+    verification = pycolmap.TwoViewGeometryOptions()
+    if hasattr(verification.ransac, "random_seed"):
+        verification.ransac.random_seed = seed
+    return {("matching_options" if modern else "sift_options"): options, "verification_options": verification}
+
+
+def has_global_mapper() -> bool:
+    """Whether this pycolmap has the global mapper (from 4.0)."""
+    return hasattr(load(), "global_mapping")
+
+
+def run_mapper(inputs: tuple[Path, Path], output: Path, use_global: bool, threads: int, seed: int) -> int:
+    """Reconstruct into ``output``/0, 1, …
+
+    Args:
+        inputs: database and image folder.
+        output: an existing folder.
+        use_global: the global mapper instead of the incremental one.
+        threads: -1 for all cores.
+        seed: of the random generators, where the version has a setting.
+
+    Returns:
+        The number of models.
+    """
+    pycolmap = load()
+    pycolmap.set_random_seed(seed)
+    options = pycolmap.GlobalPipelineOptions() if use_global else pycolmap.IncrementalPipelineOptions()
+    options.num_threads = threads
+    for name, value in (("min_model_size", 3), ("random_seed", seed)):
+        if hasattr(options, name):
+            setattr(options, name, value)
+    run = pycolmap.global_mapping if use_global else pycolmap.incremental_mapping
+    models = run(str(inputs[0]), str(inputs[1]), str(output), options=options)
+    return len(models)

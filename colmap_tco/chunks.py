@@ -76,7 +76,7 @@ def plan_chunks(common: Ints, max_views: int) -> ChunkPlan:
             chunks.append(Chunk(tuple(members)))
         else:
             room = max_views - max(1, round(max_views * CONTEXT_SHARE))
-            for group in _merge(_grow(common, members, room), common, room):
+            for group in _merge(_grow(common, members, room), common, (room + max_views) // 2):
                 chunks.append(Chunk(tuple(sorted(group)), _context(common, group, max_views)))
     return ChunkPlan(tuple(sorted(chunks, key=lambda chunk: chunk.owned)), skipped)
 
@@ -123,7 +123,14 @@ def _grow(common: Ints, members: list[int], room: int) -> list[list[int]]:
 
 
 def _merge(groups: list[list[int]], common: Ints, room: int) -> list[list[int]]:
-    """Join fragments that growing left behind to the group with which they share most, where they fit."""
+    """Join fragments that growing left behind to the group with which they share most, where they fit.
+
+    Args:
+        groups: disjoint sets of views.
+        common: (V, V) number of points that two views share.
+        room: largest size of a joined group. It may take some of the context's place: a chunk of one
+            view and its context costs as much as a full one.
+    """
     groups = sorted(groups, key=len)
     merged: list[list[int]] = []
     for i, group in enumerate(groups):

@@ -1,0 +1,252 @@
+"""Bare images → a sparse model: COLMAP's own extraction, matching and mapping."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_tco import _pycolmap
+from colmap_tco._pycolmap import Ints
+from colmap_tco.errors import InputError, MissingError
+from colmap_tco.workspace import decoded_size, existing_root, find_images, find_models, list_images, listing
+from tco.config import knob
+
+log = logging.getLogger(__name__)
+
+EXHAUSTIVE_UP_TO = 150
+"""Images up to which all pairs are matched: about ten thousand pairs."""
+_BLOCK = 64
+
+
+@dataclass(frozen=True)
+class MappingConfig:
+    """How a model is made where there is none."""
+
+    mapper: str = knob(
+        "incremental",
+        "how poses are found: incremental is robust; global is faster from about 100 images on",
+        choices=("incremental", "global"),
+    )
+    matcher: str = knob(
+        "auto",
+        "which pairs are matched: exhaustive, all; sequential, neighbours in name order (videos); retrieval, "
+        "the most similar ones; auto: exhaustive up to 150 images, above that retrieval",
+        choices=("auto", "exhaustive", "sequential", "retrieval"),
+    )
+    overlap: int = knob(10, "neighbours in name order that sequential and retrieval matching include")
+    num_similar: int = knob(30, "images that retrieval matches with each image; raise if models split")
+    cameras: str = knob(
+        "shared",
+        "shared: one camera for all images of one size, make, model and focal length (EXIF); "
+        "per_image: one for each, for collections from unknown cameras",
+        choices=("shared", "per_image"),
+    )
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What the steps of one mapping have in common."""
+
+    folder: Path
+    names: list[str]
+    scratch: Path
+    threads: int
+    seed: int
+
+    @property
+    def database(self) -> Path:
+        return self.scratch / "database.db"
+
+
+def ensure_model(
+    root: Path | str,
+    image_path: str = "",
+    config: MappingConfig = MappingConfig(),
+    num_threads: int = -1,
+    seed: int = 0,
+) -> list[Path]:
+    """The sparse models of a workspace; made from its images if there are none.
+
+    Everything is made in ``.sparse-tco.partial`` and renamed at the end: models to ``sparse/``, the
+    database to ``database.db`` unless the workspace has one, which is left alone.
+
+    Args:
+        root: the workspace.
+        image_path: image folder, if not in its usual place.
+        config: how to map.
+        num_threads: -1 for all cores.
+        seed: with one thread the result is repeatable; with several it is nearly so.
+
+    Raises:
+        InputError: fewer than two readable images, ``sparse`` in the way, or no reconstruction.
+        MissingError: the installed pycolmap lacks the mapper or matcher that was asked for.
+    """
+    root = existing_root(root)
+    models = find_models(root)
+    if models:
+        return models
+    sparse = root / "sparse"
+    if sparse.exists() and any(sparse.iterdir()):
+        raise InputError(
+            f"{sparse} is not empty and holds no model; move it away, or name one with --model_path"
+        )
+    _check_version(config)
+    folder = find_images(root, image_path)
+    names = _readable(folder, list_images(folder, recursive=folder != root))
+    scratch = root / ".sparse-tco.partial"
+    shutil.rmtree(scratch, ignore_errors=True)
+    (scratch / "sparse").mkdir(parents=True)
+    log.info("no sparse model in %s: mapping %d images of %s", root, len(names), folder)
+    _reconstruct(_Job(folder, names, scratch, num_threads, seed), config)
+    if (root / "database.db").exists():
+        log.info("%s is left as it is", root / "database.db")
+    else:
+        os.replace(scratch / "database.db", root / "database.db")
+    os.replace(scratch / "sparse", sparse)
+    shutil.rmtree(scratch)
+    return find_models(root)
+
+
+def _check_version(config: MappingConfig) -> None:
+    lacking = None
+    if config.mapper == "global" and not _pycolmap.has_global_mapper():
+        lacking = "--mapper global"
+    if config.matcher == "retrieval" and not _pycolmap.can_match_pairs():
+        lacking = "--matcher retrieval"
+    if lacking:
+        raise MissingError(f"{lacking} needs pycolmap 4.0 or later; install it with pip install -U pycolmap")
+
+
+def _readable(folder: Path, names: list[str]) -> list[str]:
+    """The names whose files can be decoded to their end."""
+    faults = {}
+    for name in names:
+        try:
+            decoded_size(folder / name)
+        except InputError as error:
+            faults[name] = str(error)
+    if faults:
+        log.warning("%d of %d images are skipped:\n%s", len(faults), len(names), listing(faults))
+    good = [name for name in names if name not in faults]
+    if len(good) < 2:
+        raise InputError(f"{folder}: {len(good)} readable images; a reconstruction needs at least two")
+    return good
+
+
+def _camera_groups(job: _Job) -> list[list[str]]:
+    """Names by size, make, model and focal length, as far as EXIF tells."""
+    from PIL import ExifTags, Image
+
+    groups: dict[tuple[object, ...], list[str]] = {}
+    for name in job.names:
+        with Image.open(job.folder / name) as image:
+            exif = image.getexif()
+            focal = exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLength)
+            make, model = exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model)
+            groups.setdefault((image.size, make, model, focal), []).append(name)
+    return list(groups.values())
+
+
+def _reconstruct(job: _Job, config: MappingConfig) -> None:
+    share = config.cameras == "shared"
+    for names in _camera_groups(job) if share else [job.names]:
+        _pycolmap.extract_features(job.database, job.folder, names, share, job.threads, job.seed)
+    matcher = _choose_matcher(config.matcher, len(job.names))
+    log.info("matching: %s", matcher)
+    if matcher == "retrieval":
+        pairs = _retrieve(job, config)
+        _pycolmap.match_pairs(job.database, pairs, job.threads, job.seed)
+    else:
+        overlap = config.overlap if matcher == "sequential" else None
+        _pycolmap.match(job.database, job.threads, job.seed, overlap)
+    inputs, output = (job.database, job.folder), job.scratch / "sparse"
+    if not _pycolmap.run_mapper(inputs, output, config.mapper == "global", job.threads, job.seed):
+        raise InputError(
+            f"{job.folder}: COLMAP found no reconstruction in {len(job.names)} images. They need texture, "
+            "much overlap, and a camera that moves sideways; --matcher exhaustive tries all pairs."
+        )
+
+
+def _choose_matcher(matcher: str, count: int) -> str:
+    if matcher != "auto":
+        return matcher
+    if count <= EXHAUSTIVE_UP_TO:
+        return "exhaustive"
+    if _pycolmap.can_match_pairs():
+        return "retrieval"
+    log.warning("pycolmap 4.0 could choose similar pairs; this version matches all pairs of %d images", count)
+    return "exhaustive"
+
+
+def _retrieve(job: _Job, config: MappingConfig) -> Path:
+    """Write the list of pairs to match, two names a line, and return its path."""
+    names, descriptors = largest_descriptors(job.database)
+    pairs = choose_pairs(similarity(descriptors), config.num_similar, config.overlap)
+    path = job.scratch / "pairs.txt"
+    path.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in pairs), encoding="utf-8")
+    log.info("%d of %d pairs look similar", len(pairs), len(names) * (len(names) - 1) // 2)
+    return path
+
+
+def largest_descriptors(database: Path, count: int = 192) -> tuple[list[str], list[NDArray[np.float32]]]:
+    """Names, ordered, and unit descriptors (n ≤ count, 128) of each image's features of largest scale.
+
+    Large features are few, repeatable, and seen from everywhere: they tell cheaply whether two images
+    overlap (preemptive matching, Wu 2013). They are read from COLMAP's SQLite tables, which are the
+    same in all versions: keypoints hold x, y, then scale and orientation or a 2 × 2 matrix.
+    """
+    names, descriptors = [], []
+    query = (
+        "SELECT images.name, keypoints.rows, keypoints.cols, keypoints.data, descriptors.data FROM images "
+        "JOIN keypoints USING (image_id) JOIN descriptors USING (image_id) ORDER BY images.name"
+    )
+    connection = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)
+    try:
+        for name, rows, cols, keypoints, features in connection.execute(query):
+            shape = np.frombuffer(keypoints or b"", np.float32).reshape(rows, cols)
+            scale = (
+                shape[:, 2] if cols == 4 else np.abs(shape[:, 2] * shape[:, 5] - shape[:, 3] * shape[:, 4])
+            )
+            best = np.argsort(-scale, kind="stable")[:count]
+            chosen = np.frombuffer(features or b"", np.uint8).reshape(rows, 128)[best].astype(np.float32)
+            names.append(name)
+            descriptors.append(chosen / np.maximum(np.linalg.norm(chosen, axis=1, keepdims=True), 1e-6))
+    finally:
+        connection.close()
+    return names, descriptors
+
+
+def similarity(descriptors: Sequence[NDArray[np.float32]], ratio: float = 0.8) -> Ints:
+    """Number of ratio-test matches (V, V) between the descriptors (n, 128) of every two images, symmetric."""
+    size = len(descriptors)
+    counts = np.zeros((size, size), np.int64)
+    for b, target in enumerate(descriptors):
+        if len(target) < 2:
+            continue
+        for start in range(0, size, _BLOCK):
+            block = descriptors[start : start + _BLOCK]
+            cosine = np.concatenate(block) @ target.T
+            top = np.partition(cosine, -2, axis=1)[:, -2:]
+            near, next_near = (np.sqrt(np.maximum(2 - 2 * top[:, k], 0)) for k in (1, 0))
+            owner = np.repeat(np.arange(start, start + len(block)), [len(d) for d in block])
+            counts[b] += np.bincount(owner[near < ratio * next_near], minlength=size)
+    np.fill_diagonal(counts, 0)
+    return counts + counts.T
+
+
+def choose_pairs(counts: Ints, num_similar: int, overlap: int) -> list[tuple[int, int]]:
+    """Pairs a < b: every image with its most similar ones, and with its neighbours in name order."""
+    size = len(counts)
+    wanted = np.abs(np.subtract.outer(np.arange(size), np.arange(size))) <= overlap
+    for a in range(size):
+        best = np.argsort(-counts[a], kind="stable")[:num_similar]
+        wanted[a, best[counts[a, best] > 0]] = True
+    return [(int(a), int(b)) for a, b in np.argwhere(np.triu(wanted | wanted.T, 1))]
