@@ -1,0 +1,185 @@
+"""Compatibility of views: what one view's surfels look like in the others, against what is there.
+
+Both terms are means over the target pixels with the weight alpha · [visible] · [valid], where alpha is
+that of the rendering. A pixel is visible where the rendered depth is not behind the target's own
+predicted depth by more than a tolerance; where it is, the target sees something nearer, and the
+comparison would punish a correct occlusion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from tco.config import knob
+from tco.render import Rendered
+from tco.types import Cameras, _Movable
+
+
+class NothingVisibleError(ValueError):
+    """No valid target pixel sees the surfels: the views do not overlap, or the depths contradict."""
+
+
+@dataclass(frozen=True)
+class Targets(_Movable):
+    """T views that surfels are rendered into.
+
+    Attributes:
+        images: (T, 3, H, W) RGB in [0, 1].
+        cameras: T cameras.
+        depth: (T, H, W) predicted depth, positive.
+        valid: (T, H, W) bool, or None if all pixels are.
+    """
+
+    images: Tensor
+    cameras: Cameras
+    depth: Tensor
+    valid: Tensor | None = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W) in pixels."""
+        return int(self.depth.shape[1]), int(self.depth.shape[2])
+
+
+@dataclass(frozen=True)
+class ObjectiveConfig:
+    """How a rendering is compared with a target; :meth:`reference` is the published code's way."""
+
+    occlusion_tolerance: float = knob(
+        0.02,
+        "A pixel counts where rendered depth ≤ (1 + this) · predicted depth + occlusion_of_mean · mean "
+        "predicted depth. Raise it where depths are coarse: errors above it are taken for occlusions.",
+    )
+    occlusion_of_mean: float = knob(
+        0.0, "Tolerance as a part of the mean depth of all targets; the published code has 1e-4 of this kind."
+    )
+    unpremultiply: bool = knob(
+        True, "Divide rendered colours by alpha, so that transparency is not taken for darkness."
+    )
+    exposure: bool = knob(
+        False, "Match mean and contrast of each colour channel for each pair of views before the comparison."
+    )
+    exposure_gradient: bool = knob(
+        False, "Differentiate through the gain and bias of exposure; off, they are constants of the step."
+    )
+    structure: float = knob(
+        0.0, "Share s of the structural term: (1 − s) · L1 + s · (1 − SSIM) / 2. 0.85 is common with SSIM."
+    )
+    ssim_window: int = knob(7, "Side of the SSIM window in pixels, odd.")
+    constant_weights: bool = knob(
+        False, "No gradient through alpha in the weights, so that surfels cannot fade to lower the loss."
+    )
+    include_source: bool = knob(
+        False, "Whether the source view is among its own targets, as in the published code."
+    )
+
+    @classmethod
+    def reference(cls) -> ObjectiveConfig:
+        """The settings that reproduce the published code."""
+        return cls(
+            occlusion_tolerance=0.0, occlusion_of_mean=1e-4, unpremultiply=False, include_source=True
+        )  # fmt: skip
+
+
+def weights(rendered: Rendered, targets: Targets, config: ObjectiveConfig) -> Tensor:
+    """Weight (T, H, W) of each target pixel: alpha where the surfels are visible and the pixel valid.
+
+    Raises:
+        NothingVisibleError: all weights are zero.
+    """
+    depth = targets.depth.detach()
+    limit = (1 + config.occlusion_tolerance) * depth + config.occlusion_of_mean * depth.mean()
+    counted = rendered.depth.detach() <= limit
+    if targets.valid is not None:
+        counted = counted & targets.valid
+    alpha = rendered.alpha.detach() if config.constant_weights else rendered.alpha
+    weight = alpha * counted
+    if not bool((weight > 0).any()):
+        raise NothingVisibleError("no valid pixel of the target views sees the surfels of the source view")
+    return weight
+
+
+def photometric(rendered: Rendered, targets: Targets, config: ObjectiveConfig | None = None) -> Tensor:
+    """Weighted mean (scalar) of the colour difference between a rendering and the target images.
+
+    L1 averaged over the channels, mixed with the structural term by ``config.structure``. Differentiable
+    in the rendering and the target images.
+
+    Raises:
+        NothingVisibleError: no pixel counts.
+    """
+    config = config or ObjectiveConfig()
+    weight = weights(rendered, targets, config)
+    color = rendered.color
+    if config.unpremultiply:
+        # A pixel of no alpha has no colour and no weight; below 1/255 the renderer draws nothing.
+        color = color / rendered.alpha.clamp_min(1 / 255).unsqueeze(-1)
+    image = targets.images.permute(0, 2, 3, 1)
+    if config.exposure:
+        gain, bias = match_exposure(color, image, weight)
+        if not config.exposure_gradient:
+            gain, bias = gain.detach(), bias.detach()
+        color = gain * color + bias
+    error = (color - image).abs().mean(-1)
+    if config.structure > 0:
+        error = (1 - config.structure) * error + config.structure * _dissimilarity(
+            color, image, weight, config
+        )
+    return _mean(error, weight)
+
+
+def geometric(rendered: Rendered, targets: Targets, config: ObjectiveConfig | None = None) -> Tensor:
+    """Weighted mean (scalar) of the L1 of depth and of its two image gradients (central differences).
+
+    Differentiable in the rendering and in the target depth.
+
+    Raises:
+        NothingVisibleError: no pixel counts.
+    """
+    weight = weights(rendered, targets, config or ObjectiveConfig())
+    error = (rendered.depth - targets.depth).abs()
+    for ours, theirs in zip(
+        torch.gradient(rendered.depth, dim=(1, 2)), torch.gradient(targets.depth, dim=(1, 2)), strict=True
+    ):
+        error = error + (ours - theirs).abs()
+    return _mean(error, weight)
+
+
+def match_exposure(color: Tensor, image: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Gain and bias (T, 1, 1, 3) that give ``color`` the weighted mean and deviation of ``image``.
+
+    gain = √((var image + ε) / (var color + ε)), within [1/2, 2], and bias = mean image − gain · mean
+    color. A least-squares gain would shrink towards 0 where the two are misaligned and so reward it;
+    equal moments do not depend on the alignment. ε = 1e-4 keeps the gain of flat regions near 1.
+
+    Args:
+        color: (T, H, W, 3).
+        image: (T, H, W, 3).
+        weight: (T, H, W); the moments are over the pixels with weight, and 0 for a target without any.
+    """
+    w = weight.detach().unsqueeze(-1)
+    w = w / w.sum((1, 2), keepdim=True).clamp_min(1e-12)
+    mean_color, mean_image = ((w * x).sum((1, 2), keepdim=True) for x in (color, image))
+    var_color = (w * (color - mean_color) ** 2).sum((1, 2), keepdim=True)
+    var_image = (w * (image - mean_image) ** 2).sum((1, 2), keepdim=True)
+    gain = ((var_image + 1e-4) / (var_color + 1e-4)).sqrt().clamp(0.5, 2.0)
+    return gain, mean_image - gain * mean_color
+
+
+def _dissimilarity(color: Tensor, image: Tensor, weight: Tensor, config: ObjectiveConfig) -> Tensor:
+    """(1 − SSIM) / 2 of each pixel (T, H, W), averaged over the channels.
+
+    Pixels without weight take the target's colour, so that they agree in the windows of the others.
+    """
+    from kornia.metrics import ssim
+
+    filled = torch.where((weight > 0).unsqueeze(-1), color, image).permute(0, 3, 1, 2)
+    similarity = ssim(filled, image.permute(0, 3, 1, 2), config.ssim_window)
+    return ((1 - similarity) / 2).clamp(0, 1).mean(1)
+
+
+def _mean(error: Tensor, weight: Tensor) -> Tensor:
+    return (weight * error).sum() / weight.sum()
