@@ -21,7 +21,7 @@ from colmap_tco.atomic import atomic_file
 from colmap_tco.errors import InputError
 
 if TYPE_CHECKING:
-    from colmap_tco.views import Pinhole
+    from colmap_tco.pinhole import Pinhole
 
 _LONGEST_HEADER = 64
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from colmap_tco.maps import map_intrinsics
 
 if TYPE_CHECKING:
-    from colmap_tco.views import Pinhole
+    from colmap_tco.pinhole import Pinhole
 
 
 def normals_from_depth(depth: NDArray[np.floating], camera: Pinhole, radius: int = 2) -> NDArray[np.float32]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from colmap_tco.normals import normals_from_depth
-from colmap_tco.views import Pinhole
+from colmap_tco.pinhole import Pinhole
 
 CAMERA = Pinhole(60, 48, 50.0, 55.0, 31.0, 22.5)
 

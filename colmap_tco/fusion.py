@@ -1,0 +1,340 @@
+"""Depth maps → one cloud: cross-view consistency, merging, normals, colours.
+
+Each view in turn is the reference. A pixel of it becomes a point if enough neighbouring views agree:
+its depth, moved into the neighbour, meets the surface that the neighbour's depth and normal describe
+there (``max_depth_error``), that surface point falls back onto the pixel (``max_reproj_error``), and
+the two normals agree (``max_normal_error``). The point is the confidence-weighted mean of the agreeing
+surfaces, its colour the median of their full-resolution images, and the pixels of the other views
+that it was made of are not used as references again.
+
+Views are loaded when they are needed and kept while they fit ``cache_size``, so that memory does not
+grow with the number of views. The result does not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_tco.errors import DensifyError
+from colmap_tco.fusion_report import FusionReport, why_empty
+from colmap_tco.ply import Cloud, Visibility, join
+from tco.config import knob
+
+if TYPE_CHECKING:
+    from colmap_tco._fusion_kernels import Limits, Maps, Votes
+    from colmap_tco._fusion_shelf import Shelf
+    from colmap_tco.pinhole import Pinhole
+
+log = logging.getLogger(__name__)
+
+_BLOCK = 2_000_000
+"""Pixels of a reference that are voted on together; bounds the memory of the votes (some 100 MB)."""
+_COLOR_SAMPLES = 15
+"""Views that a colour is the median of, at most."""
+_FEWEST_VIEWS = 3
+"""Where fewer views than ``min_num_pixels`` can see a point, all of them but at least these must agree."""
+
+
+@dataclass(frozen=True)
+class FusionConfig:
+    """Which depths agree and which pixels take part; COLMAP's names and defaults where these exist."""
+
+    min_num_pixels: int = knob(
+        5,
+        "Views that must agree on a point, the reference included. A pixel that fewer views could see "
+        "needs all of those, at least 3 (2 where a view has one neighbour). Lower it for few images.",
+    )
+    max_reproj_error: float = knob(
+        2.0,
+        "Largest distance, in pixels of the full image, between a pixel and its way to a neighbour and back.",
+    )
+    max_depth_error: float = knob(
+        0.01, "Largest relative difference between depths that agree: |z − d| / z. Raise it for noisy depths."
+    )
+    max_normal_error: float = knob(10.0, "Largest angle, in degrees, between normals that agree.")
+    check_num_images: int = knob(50, "Neighbours that a view is compared with, the best overlapping first.")
+    cache_size: float = knob(
+        4.0,
+        "Gigabytes of maps and images kept in memory (COLMAP: 32). More saves reading when views are many.",
+    )
+    num_threads: int = knob(-1, "Threads for fusion; -1 is one a core.")
+    min_confidence: float = knob(
+        1.0, "Pixels of a lower confidence are dropped. Confidence is at least 1, so that 1 keeps all."
+    )
+    max_depth_bend: float = knob(
+        0.05,
+        "Pixels beside a discontinuity, where flying points arise, are dropped: those whose inverse depth q "
+        "has a relative second difference |q₋ − 2 q + q₊| / q above this; planes have none. 0 switches it off.",
+    )
+    max_view_angle: float = knob(
+        85.0, "Surfaces seen at a larger angle to their normal, in degrees, are dropped. 90 switches it off."
+    )
+    max_conflicts: float = knob(
+        1.0,
+        "A point is dropped if the views that look through it, to a surface behind, are more than this many "
+        "times the views that agree on it. 0 switches it off.",
+    )
+    sigma_at_one: float = knob(
+        0.0,
+        "Relative depth error s of a pixel of confidence 1; that of confidence c is s / c. If given, the "
+        "allowed error is max(max_depth_error, √(s²/c₁² + s²/c₂²)), for depths whose confidence is "
+        "calibrated. 0: not used.",
+    )
+    most_depth_error: float = knob(0.05, "Bound of the allowed relative error where sigma_at_one raises it.")
+
+
+@dataclass(frozen=True)
+class FusionMaps:
+    """The arrays of one view.
+
+    Attributes:
+        depth: (H, W) camera z, 0 where there is none; may be smaller than the image.
+        normal: (H, W, 3) unit normals in the camera frame, facing the camera, 0 where there is none.
+        image: (H', W', 3) uint8 RGB, undistorted, of any size with the camera's field of view.
+        confidence: (H, W) at least 1, or None if there is none.
+        mask: (H, W) bool, False where pixels shall take no part, or None.
+    """
+
+    depth: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    image: NDArray[np.uint8]
+    confidence: NDArray[np.float32] | None = None
+    mask: NDArray[np.bool_] | None = None
+
+
+@dataclass(frozen=True)
+class FusionView:
+    """One view of the dense workspace.
+
+    Attributes:
+        name: image name, for messages and the report.
+        index: position of the image in ``Reconstruction.reg_image_ids()``, for the visibility.
+        camera: pinhole of the undistorted image.
+        cam_from_world: (3, 4) or (4, 4) float64.
+        neighbours: positions in the list of views that is fused, the best overlapping first.
+        load: reads the arrays; called again if they had to leave the cache.
+    """
+
+    name: str
+    index: int
+    camera: Pinhole
+    cam_from_world: NDArray[np.float64]
+    neighbours: tuple[int, ...]
+    load: Callable[[], FusionMaps]
+
+
+def fuse(views: Sequence[FusionView], config: FusionConfig | None = None) -> tuple[Cloud, FusionReport]:
+    """Fuse all views into one cloud; see :func:`fuse_views`.
+
+    Raises:
+        DensifyError: no point is left; the message names the filter that removed most.
+    """
+    config = config or FusionConfig()
+    report = FusionReport()
+    cloud = join(fuse_views(views, config, report))
+    if not len(cloud):
+        raise DensifyError(why_empty(report))
+    if report.lowered:
+        log.info("%d of %d points are confirmed by fewer than min_num_pixels=%d views, for no more see them",
+                 report.lowered, len(cloud), config.min_num_pixels)  # fmt: skip
+    return cloud, report
+
+
+def fuse_views(views: Sequence[FusionView], config: FusionConfig, report: FusionReport) -> Iterator[Cloud]:
+    """Fuse view after view: one cloud for each of ``views`` in turn, in the world frame.
+
+    Args:
+        views: all views; their neighbours are positions in this list.
+        config: bounds and filters.
+        report: is filled while the clouds are taken.
+
+    Raises:
+        ValueError: settings or neighbours out of range, or arrays of a view that do not fit together.
+    """
+    from colmap_tco._fusion_shelf import Shelf, threads
+
+    _check(views, config)
+    shelf = Shelf(views, config)
+    with threads(config.num_threads):
+        for position, view in enumerate(views):
+            cloud = _fuse_reference(shelf, views, position, config, report)
+            report.points[view.name] = len(cloud)
+            report.pixels["points"] += len(cloud)
+            report.loads, report.peak_bytes = shelf.loads, shelf.peak_bytes
+            shelf.finish(position)
+            yield cloud
+
+
+def _check(views: Sequence[FusionView], config: FusionConfig) -> None:
+    for name in ("min_num_pixels", "check_num_images", "max_reproj_error", "max_depth_error", "cache_size"):
+        if not getattr(config, name) > 0:
+            raise ValueError(f"{name} must be positive, not {getattr(config, name)}")
+    for position, view in enumerate(views):
+        wrong = [n for n in view.neighbours if not 0 <= n < len(views) or n == position]
+        if wrong or len(set(view.neighbours)) != len(view.neighbours):
+            raise ValueError(f"{view.name}: neighbours {view.neighbours} are not other views, each once")
+
+
+def _fuse_reference(
+    shelf: Shelf, views: Sequence[FusionView], position: int, config: FusionConfig, report: FusionReport
+) -> Cloud:
+    """The points of one reference view."""
+    # A set in ascending order: the result does not depend on the order within the list.
+    neighbours = sorted(views[position].neighbours[: config.check_num_images])
+    reference = shelf.get(position)
+    for reason, count in reference.dropped.items():
+        report.pixels[reason] += count
+    report.pixels["all"] += reference.maps.depth.size
+    has_depth = reference.maps.depth.ravel() > 0
+    free = has_depth & (reference.taken.ravel() == 0)
+    report.pixels["already_fused"] += int(has_depth.sum() - free.sum())
+    pixels = np.flatnonzero(free)
+    blocks = np.array_split(pixels, max(1, math.ceil(len(pixels) / _BLOCK)))
+    fuser = _Reference(shelf, views, position, neighbours, config, report)
+    return join(fuser.fuse(block) for block in blocks)
+
+
+@dataclass(frozen=True)
+class _Reference:
+    """One reference view and its neighbours."""
+
+    shelf: Shelf
+    views: Sequence[FusionView]
+    position: int
+    neighbours: list[int]
+    config: FusionConfig
+    report: FusionReport
+
+    def fuse(self, pixels: NDArray[np.int64]) -> Cloud:
+        """The points of these pixels (M,), flat indices into the reference."""
+        votes = self._vote(pixels)
+        keep = self._accept(votes)
+        pixels, votes = pixels[keep], votes.select(keep)
+        points, normals = self._average(pixels, votes)
+        colors = self._colors_and_marks(points, votes)
+        view = self.views[self.position]
+        rotation, centre = view.cam_from_world[:3, :3], _centre(view)
+        return Cloud(
+            points.astype(np.float64) @ rotation + centre,
+            (normals @ rotation).astype(np.float32),
+            colors,
+            self._visibility(votes),
+        )
+
+    def _vote(self, pixels: NDArray[np.int64]) -> Votes:
+        from colmap_tco import _fusion_kernels as kernels
+
+        count, words = len(pixels), max(1, math.ceil(len(self.neighbours) / 64))
+        votes = kernels.Votes(
+            seen=np.zeros(count, np.uint16),
+            support=np.ones(count, np.uint16),
+            conflicts=np.zeros(count, np.uint16),
+            weight=np.zeros(count, np.float32),
+            shift=np.zeros((count, 3), np.float32),
+            normal=np.zeros((count, 3), np.float32),
+            who=np.zeros((count, words), np.uint64),
+        )
+        limits = self._limits()
+        for slot, neighbour in enumerate(self.neighbours):
+            other = self.shelf.get(neighbour)
+            found = kernels.vote(self._maps(), pixels, other.maps, self._to(neighbour), limits, slot, votes)
+            failed = self.report.comparisons
+            failed["max_depth_error"] += int(found[[kernels.OCCLUDED, kernels.THROUGH, kernels.DEPTH]].sum())
+            failed["max_reproj_error"] += int(found[kernels.REPROJECTION])
+            failed["max_normal_error"] += int(found[kernels.NORMAL])
+        return votes
+
+    def _accept(self, votes: Votes) -> NDArray[np.bool_]:
+        """Which pixels have the support that they need; counts the others."""
+        wanted = self.config.min_num_pixels
+        fewest = min(wanted, max(2, min(_FEWEST_VIEWS, 1 + len(self.neighbours))))
+        required = np.minimum(wanted, np.maximum(fewest, votes.seen + 1))
+        supported = votes.support >= required
+        through = np.zeros(len(supported), bool)
+        if self.config.max_conflicts > 0:
+            through = votes.conflicts > self.config.max_conflicts * votes.support
+        keep = supported & ~through
+        self.report.pixels["max_conflicts"] += int(through.sum())
+        self.report.pixels["min_num_pixels"] += int((~supported & ~through).sum())
+        self.report.lowered += int((keep & (votes.support < wanted)).sum())
+        return keep
+
+    def _average(
+        self, pixels: NDArray[np.int64], votes: Votes
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        from colmap_tco import _merge_kernels as kernels
+
+        points, normals = np.empty((len(pixels), 3), np.float32), np.empty((len(pixels), 3), np.float32)
+        kernels.average(self._maps(), pixels, votes, points, normals)
+        return points, normals
+
+    def _colors_and_marks(self, points: NDArray[np.float32], votes: Votes) -> NDArray[np.uint8]:
+        """Colours (M, 3) of the points, whose pixels in the other views are marked as taken."""
+        from colmap_tco import _merge_kernels as kernels
+
+        samples = np.empty((len(points), min(_COLOR_SAMPLES, 1 + len(self.neighbours)), 3), np.uint8)
+        count = np.zeros(len(points), np.uint8)
+        footprint = points[:, 2] / np.float32(self._maps().intrinsics[0])
+        own = self.shelf.get(self.position)
+        everyone = np.ones(len(points), bool)
+        kernels.sample_colors(points, everyone, np.eye(3, 4), own.image_intrinsics, own.image, samples, count)
+        for slot, neighbour in enumerate(self.neighbours):
+            other = self.shelf.get(neighbour)
+            who, move = _agrees(votes, slot), self._to(neighbour)
+            kernels.sample_colors(points, who, move, other.image_intrinsics, other.image, samples, count)
+            error = self.config.max_depth_error
+            kernels.mark_taken(points, who, footprint, move, other.maps, error, other.taken)
+        colors = np.empty((len(points), 3), np.uint8)
+        kernels.median_colors(samples, count, colors)
+        return colors
+
+    def _visibility(self, votes: Votes) -> Visibility:
+        columns = [_agrees(votes, slot) for slot in range(len(self.neighbours))]
+        seen = np.stack([np.ones(len(votes.seen), bool), *columns], 1)
+        images = np.array([self.views[p].index for p in (self.position, *self.neighbours)], np.uint32)
+        order = np.argsort(images, kind="stable")
+        point, column = np.nonzero(seen[:, order])
+        start = np.zeros(len(seen) + 1, np.int64)
+        np.cumsum(np.bincount(point, minlength=len(seen)), out=start[1:])
+        return Visibility(start, images[order][column])
+
+    def _maps(self) -> Maps:
+        return self.shelf.get(self.position).maps
+
+    def _to(self, neighbour: int) -> NDArray[np.float64]:
+        """The (3, 4) transform from the reference camera to a neighbour."""
+        ref, other = self.views[self.position], self.views[neighbour]
+        rotation = other.cam_from_world[:3, :3] @ ref.cam_from_world[:3, :3].T
+        shift = other.cam_from_world[:3, :3] @ (_centre(ref) - _centre(other))
+        return np.ascontiguousarray(np.concatenate([rotation, shift[:, None]], 1))
+
+    def _limits(self) -> Limits:
+        from colmap_tco import _fusion_kernels as kernels
+
+        camera, shape = self.views[self.position].camera, self._maps().depth.shape
+        return kernels.Limits(
+            depth_error=self.config.max_depth_error,
+            reproj_error=self.config.max_reproj_error,
+            cos_normal=math.cos(math.radians(self.config.max_normal_error)),
+            sigma_at_one=self.config.sigma_at_one,
+            most_depth_error=self.config.most_depth_error,
+            pixel_x=camera.width / shape[1],
+            pixel_y=camera.height / shape[0],
+        )
+
+
+def _agrees(votes: Votes, slot: int) -> NDArray[np.bool_]:
+    """(M,) whether the neighbour in this slot agrees."""
+    return ((votes.who[:, slot >> 6] >> np.uint64(slot & 63)) & np.uint64(1)).astype(bool)
+
+
+def _centre(view: FusionView) -> NDArray[np.float64]:
+    """World position (3,) of the camera."""
+    return -view.cam_from_world[:3, :3].T @ view.cam_from_world[:3, 3]
