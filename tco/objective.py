@@ -8,40 +8,21 @@ comparison would punish a correct occlusion.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from tco.config import knob
-from tco.render import Rendered
-from tco.types import Cameras, _Movable
+from tco.geometry import invert, project, sample, transform, unproject
+from tco.render import Rendered, render
+from tco.surfels import Surfels
+from tco.types import Cameras, Prediction
 
 
 class NothingVisibleError(ValueError):
     """No valid target pixel sees the surfels: the views do not overlap, or the depths contradict."""
-
-
-@dataclass(frozen=True)
-class Targets(_Movable):
-    """T views that surfels are rendered into.
-
-    Attributes:
-        images: (T, 3, H, W) RGB in [0, 1].
-        cameras: T cameras.
-        depth: (T, H, W) predicted depth, positive.
-        valid: (T, H, W) bool, or None if all pixels are.
-    """
-
-    images: Tensor
-    cameras: Cameras
-    depth: Tensor
-    valid: Tensor | None = None
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(H, W) in pixels."""
-        return int(self.depth.shape[1]), int(self.depth.shape[2])
 
 
 @dataclass(frozen=True)
@@ -75,6 +56,7 @@ class ObjectiveConfig:
     include_source: bool = knob(
         False, "Whether the source view is among its own targets, as in the published code."
     )
+    renderer: str = knob("cpu", "Engine that renders the surfels.", choices=("cpu", "gsplat", "twin"))
 
     @classmethod
     def reference(cls) -> ObjectiveConfig:
@@ -84,17 +66,94 @@ class ObjectiveConfig:
         )  # fmt: skip
 
 
-def weights(rendered: Rendered, targets: Targets, config: ObjectiveConfig) -> Tensor:
+def photometric(
+    surfels: Surfels, images: Tensor, cameras: Cameras, depth: Tensor,
+    valid: Tensor | None = None, config: ObjectiveConfig | None = None,
+) -> Tensor:  # fmt: skip
+    """Weighted mean (scalar) of the colour difference between rendered surfels and T target views.
+
+    Differentiable in the surfels, the cameras and the images.
+
+    Args:
+        surfels: of the source view.
+        images: (T, 3, H, W) RGB in [0, 1].
+        cameras: T target cameras.
+        depth: (T, H, W) predicted depth of the targets, which decides on visibility alone.
+        valid: (T, H, W) bool, or None if all pixels are.
+        config: weights and options.
+
+    Raises:
+        NothingVisibleError: no pixel counts.
+    """
+    config = config or ObjectiveConfig()
+    rendered = render(surfels, cameras, _size(depth), config.renderer)
+    return color_difference(rendered, images, weights(rendered, depth, valid, config), config)
+
+
+def geometric(
+    surfels: Surfels, cameras: Cameras, depth: Tensor,
+    valid: Tensor | None = None, config: ObjectiveConfig | None = None,
+) -> Tensor:  # fmt: skip
+    """Weighted mean (scalar) of the depth difference between rendered surfels and T target views.
+
+    Differentiable in the surfels, the cameras and the target depth. Arguments and errors as in
+    :func:`photometric`.
+    """
+    config = config or ObjectiveConfig()
+    rendered = render(surfels, cameras, _size(depth), config.renderer)
+    return depth_difference(rendered, depth, weights(rendered, depth, valid, config))
+
+
+def consistency(
+    depth: Tensor,
+    cameras: Cameras,
+    source: int,
+    targets: Sequence[int],
+    context: Prediction,
+    tolerance: float = 0.02,
+) -> Tensor:
+    """Disagreement (scalar) of one view's depth with the depth that others predict for the same points.
+
+    Each pixel of the source is projected into the targets; with z its depth there and d the target's
+    depth sampled bilinearly in inverse depth, e = z / d − 1 costs τ log(1 + |e| / τ): L1 near zero, and
+    indifferent to occlusions, for which e is large. Mean over the projections that fall into a target.
+
+    Args:
+        depth: (H, W) of the source, differentiable.
+        cameras: of all V views, differentiable.
+        source: index of the source.
+        targets: indices of the targets.
+        context: prediction for all V views, held constant.
+        tolerance: τ, relative.
+
+    Raises:
+        NothingVisibleError: no pixel of the source falls into a target.
+    """
+    h, w = depth.shape
+    chosen = list(targets)
+    target_from_source = invert(cameras.world_from_cam[chosen]) @ cameras.world_from_cam[source]
+    points = unproject(depth, cameras.K[source]).reshape(1, -1, 3)
+    xy, z = project(transform(target_from_source, points), cameras.K[chosen])
+    size = xy.new_tensor([w, h])
+    inside = (z > 1e-3) & ((xy >= 0.5) & (xy <= size - 0.5)).all(-1)
+    if not bool(inside.any()):
+        raise NothingVisibleError(f"no pixel of view {source} falls into one of the views {chosen}")
+    inverse = sample(1 / context.depth[chosen].detach().clamp_min(1e-6).unsqueeze(1), xy)[:, 0]
+    error = (z * inverse - 1).abs()[inside]
+    return (tolerance * torch.log1p(error / tolerance)).mean()
+
+
+def weights(rendered: Rendered, depth: Tensor, valid: Tensor | None, config: ObjectiveConfig) -> Tensor:
     """Weight (T, H, W) of each target pixel: alpha where the surfels are visible and the pixel valid.
 
     Raises:
         NothingVisibleError: all weights are zero.
     """
-    depth = targets.depth.detach()
+    depth = depth.detach()
     limit = (1 + config.occlusion_tolerance) * depth + config.occlusion_of_mean * depth.mean()
     counted = rendered.depth.detach() <= limit
-    if targets.valid is not None:
-        counted = counted & targets.valid
+    if valid is not None:
+        counted = counted & valid
     alpha = rendered.alpha.detach() if config.constant_weights else rendered.alpha
     weight = alpha * counted
     if not bool((weight > 0).any()):
@@ -102,22 +161,20 @@ def weights(rendered: Rendered, targets: Targets, config: ObjectiveConfig) -> Te
     return weight
 
 
-def photometric(rendered: Rendered, targets: Targets, config: ObjectiveConfig | None = None) -> Tensor:
-    """Weighted mean (scalar) of the colour difference between a rendering and the target images.
+def color_difference(rendered: Rendered, images: Tensor, weight: Tensor, config: ObjectiveConfig) -> Tensor:
+    """Weighted mean (scalar) of L1 over the channels, mixed with the structural term by ``config.structure``.
 
-    L1 averaged over the channels, mixed with the structural term by ``config.structure``. Differentiable
-    in the rendering and the target images.
-
-    Raises:
-        NothingVisibleError: no pixel counts.
+    Args:
+        rendered: T renderings.
+        images: (T, 3, H, W).
+        weight: (T, H, W), not all zero.
+        config: exposure, structure and the treatment of alpha.
     """
-    config = config or ObjectiveConfig()
-    weight = weights(rendered, targets, config)
     color = rendered.color
     if config.unpremultiply:
         # A pixel of no alpha has no colour and no weight; below 1/255 the renderer draws nothing.
         color = color / rendered.alpha.clamp_min(1 / 255).unsqueeze(-1)
-    image = targets.images.permute(0, 2, 3, 1)
+    image = images.permute(0, 2, 3, 1)
     if config.exposure:
         gain, bias = match_exposure(color, image, weight)
         if not config.exposure_gradient:
@@ -131,19 +188,11 @@ def photometric(rendered: Rendered, targets: Targets, config: ObjectiveConfig | 
     return _mean(error, weight)
 
 
-def geometric(rendered: Rendered, targets: Targets, config: ObjectiveConfig | None = None) -> Tensor:
-    """Weighted mean (scalar) of the L1 of depth and of its two image gradients (central differences).
-
-    Differentiable in the rendering and in the target depth.
-
-    Raises:
-        NothingVisibleError: no pixel counts.
-    """
-    weight = weights(rendered, targets, config or ObjectiveConfig())
-    error = (rendered.depth - targets.depth).abs()
-    for ours, theirs in zip(
-        torch.gradient(rendered.depth, dim=(1, 2)), torch.gradient(targets.depth, dim=(1, 2)), strict=True
-    ):
+def depth_difference(rendered: Rendered, depth: Tensor, weight: Tensor) -> Tensor:
+    """Weighted mean (scalar) of the L1 of depth (T, H, W) and of its central differences in the image."""
+    error = (rendered.depth - depth).abs()
+    slopes = (torch.gradient(d, dim=(1, 2)) for d in (rendered.depth, depth))
+    for ours, theirs in zip(*slopes, strict=True):
         error = error + (ours - theirs).abs()
     return _mean(error, weight)
 
@@ -183,3 +232,7 @@ def _dissimilarity(color: Tensor, image: Tensor, weight: Tensor, config: Objecti
 
 def _mean(error: Tensor, weight: Tensor) -> Tensor:
     return (weight * error).sum() / weight.sum()
+
+
+def _size(depth: Tensor) -> tuple[int, int]:
+    return int(depth.shape[-2]), int(depth.shape[-1])

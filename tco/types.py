@@ -144,8 +144,8 @@ class Prediction(_Movable):
     Attributes:
         depth: (V, H, W) positive.
         confidence: (V, H, W), at least 1.
-        cameras: poses and intrinsics of these views, predicted or passed through.
-        views: V indices into the chunk.
+        cameras: poses and intrinsics of all views of the chunk, predicted or passed through.
+        views: V indices into the chunk, of the views whose depth this is.
     """
 
     depth: Tensor

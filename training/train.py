@@ -50,6 +50,15 @@ class TrainConfig:
     seed: int = 0
 
 
+def half() -> torch.autocast:
+    """Convolutions and products in bfloat16, twice as fast in three dimensions.
+
+    The refinement stays in float32: there, oneDNN's gradient of a bfloat16 convolution with dilation 4
+    was not finite (torch 2.13), and little time would be won.
+    """
+    return torch.autocast("cpu", torch.bfloat16)
+
+
 def pooled(depth: Tensor, factor: int) -> Tensor:
     """Inverse depth (V, h, w), 0 where unknown: the mean where the surface is smooth, else one pixel's."""
     inverse = torch.where(depth > 0, 1 / depth.clamp_min(1e-6), torch.zeros_like(depth)).unsqueeze(1)
@@ -89,7 +98,8 @@ def losses(net: Sweep, sample: tuple, refined: list[int], sources: int) -> tuple
     """Total loss of one sample, and figures for the log."""
     views, priors, depth = sample
     encoded = net.encode(views, priors, sources)
-    first = net.coarse(encoded, range(len(views)))
+    with half():
+        first = net.coarse(encoded, range(len(views)))
     total = coarse_loss(first, encoded, pooled(depth, 4))
     world = _detached(_doubled(first))
     each = {v: Stage(first.inverse[v : v + 1], first.log_error[v : v + 1]) for v in refined}
@@ -139,7 +149,8 @@ class Trainer:
         torch.save(state, self.out / "state.part")
         (self.out / "state.part").replace(self.out / "state.pt")
         info = {"config": json.dumps(self.mean.metadata()), "steps": str(self.step)}
-        save_file(self.mean.state_dict(), self.out / "weights.part", info)
+        tensors = {k: v.contiguous() for k, v in self.mean.state_dict().items()}
+        save_file(tensors, self.out / "weights.part", info)
         (self.out / "weights.part").replace(self.out / "weights.safetensors")
 
     def rate(self) -> float:

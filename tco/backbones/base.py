@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from torch import nn
 
-from tco.types import Prediction, Priors, Views
+from tco.types import Prediction, Priors, SparseDepth, Views
 
 
 @runtime_checkable
@@ -34,6 +34,14 @@ class Backbone(Protocol):
         self, encoded: Any, views: Sequence[int] | None = None, context: Prediction | None = None
     ) -> Prediction:
         """Predict the given views of the chunk (all if None)."""
+        ...
+
+    def with_points(self, encoded: Any, points: Mapping[int, SparseDepth]) -> Any:
+        """The same features, with other sparse points as input for some views.
+
+        Optimisation hides a part of the points from the network and asks it to predict them. A
+        network that takes no points as input returns ``encoded`` itself.
+        """
         ...
 
     def decoder(self) -> nn.Module:

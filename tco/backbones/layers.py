@@ -21,14 +21,17 @@ class Conv(nn.Module):
         return F.relu(self.norm(self.conv(x)), inplace=True)
 
 
-class Pointwise(nn.Linear):
+class Pointwise(nn.Module):
     """A 1×1 convolution over maps or volumes, as one matrix product (many times faster on a CPU)."""
+
+    def __init__(self, cin: int, cout: int) -> None:
+        super().__init__()
+        like = nn.Linear(cin, cout)
+        self.weight, self.bias = like.weight, like.bias
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, cin, …) → (B, cout, …)."""
-        y = self.weight @ x.flatten(2)
-        if self.bias is not None:
-            y = y + self.bias.unsqueeze(-1)
+        y = self.weight @ x.flatten(2) + self.bias.unsqueeze(-1)
         return y.unflatten(2, x.shape[2:])
 
 

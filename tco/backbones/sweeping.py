@@ -146,6 +146,14 @@ class Hints:
     def __getitem__(self, views: Tensor | slice) -> Hints:
         return Hints(self.nearest[views], self.smooth[views], self.distance[views])
 
+    def replaced(self, views: Tensor, other: Hints) -> Hints:
+        """A copy in which some views have the hints of ``other``."""
+        parts = (
+            a.index_copy(0, views, b)
+            for a, b in ((self.nearest, other.nearest), (self.smooth, other.smooth), (self.distance, other.distance))
+        )
+        return Hints(*parts)
+
     def at(self, planes: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
         """How well hypotheses (B, D, h, w) fit the points, (B, D, h, w), and the nearest one's offset in steps."""
         width = 0.7 + 0.5 * self.distance

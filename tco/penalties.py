@@ -1,0 +1,218 @@
+"""What is known beside the images, as penalties: one function a prior, each a scalar to be weighted.
+
+Poses are ``world_from_cam`` of V views; predicted and prior poses may have different worlds, because
+both are expressed in their first view before they are compared. A prior without data is an error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from tco.config import knob
+from tco.geometry import invert, sample, scale_shift
+from tco.types import SparseDepth
+
+
+def in_first_view(world_from_cam: Tensor) -> Tensor:
+    """Poses (V, 4, 4) with the first view as the world: the first of them is the identity."""
+    return invert(world_from_cam[:1]) @ world_from_cam
+
+
+def rotation_angle(a: Tensor, b: Tensor) -> Tensor:
+    """Angle (…) in radians, in [0, π], between rotations (…, 3, 3).
+
+    With M = Aᵗ B, v = vee(M − Mᵗ) / 2 = sin θ · axis and c = (tr M − 1) / 2 = cos θ, the angle is
+    atan2(|v|, c). The arc cosine of c would have an infinite derivative at 0 and π; here the derivative
+    is the axis, of length 1, up to θ = 0 and θ = π themselves, where no axis is defined: there v = 0 and
+    its derivative is taken as 0.
+    """
+    M = a.transpose(-1, -2) @ b
+    v = (
+        torch.stack(
+            [M[..., 2, 1] - M[..., 1, 2], M[..., 0, 2] - M[..., 2, 0], M[..., 1, 0] - M[..., 0, 1]], -1
+        )
+        / 2
+    )
+    square = (v * v).sum(-1)
+    none = square == 0
+    sine = torch.where(none, torch.ones_like(square), square).sqrt()
+    sine = torch.where(none, torch.zeros_like(sine), sine)
+    cosine = (M.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
+    return torch.atan2(sine, cosine)
+
+
+def rotation(predicted: Tensor, prior: Tensor) -> Tensor:
+    """Mean angle (radians) between predicted and prior rotations, each relative to its first view.
+
+    The mean is over all V views, the first with its angle of zero included, as in the paper.
+
+    Args:
+        predicted: (V, 4, 4) world_from_cam.
+        prior: (V, 4, 4) world_from_cam, of any world.
+
+    Raises:
+        ValueError: fewer than two views, which have no relative pose.
+    """
+    ours, theirs = _relative(predicted, prior)
+    return rotation_angle(ours[:, :3, :3], theirs[:, :3, :3]).mean()
+
+
+def translation(predicted: Tensor, prior: Tensor) -> Tensor:
+    """Mean L1 between camera centres relative to the first view, each set divided by its mean distance.
+
+    The division makes the term independent of either scale. The mean is over V views and three axes.
+
+    Args:
+        predicted: (V, 4, 4) world_from_cam.
+        prior: (V, 4, 4) world_from_cam, of any world and scale.
+
+    Raises:
+        ValueError: fewer than two views, or all centres of a set in one point, which have no scale.
+    """
+    ours, theirs = (pose[:, :3, 3] for pose in _relative(predicted, prior))
+    scales = [_mean_distance(centres, name) for centres, name in ((ours, "predicted"), (theirs, "prior"))]
+    return (ours / scales[0] - theirs / scales[1]).abs().mean()
+
+
+def _relative(predicted: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
+    if predicted.shape != prior.shape:
+        raise ValueError(
+            f"predicted poses {tuple(predicted.shape)} and priors {tuple(prior.shape)} differ in shape"
+        )
+    if len(predicted) < 2:
+        raise ValueError("a pose penalty compares relative poses and needs at least two views")
+    return in_first_view(predicted), in_first_view(prior)
+
+
+def _mean_distance(centres: Tensor, name: str) -> Tensor:
+    # A distance of zero has no direction: the first centre is left out of the norm and counts as 0.
+    mean = centres[1:].norm(dim=-1).sum() / len(centres)
+    if float(mean.detach()) <= 1e-9:
+        raise ValueError(f"the {name} camera centres all coincide: their translation cannot be normalised")
+    return mean
+
+
+def focal(predicted: Tensor, prior: Tensor) -> Tensor:
+    """|Δfx| + |Δfy| in pixels, mean over V views, of intrinsics (V, 3, 3): the paper's term."""
+    difference = (_focals(predicted) - _focals(prior)).abs()
+    return difference.sum(-1).mean()
+
+
+def intrinsics_reference(predicted: Tensor, prior: Tensor) -> Tensor:
+    """(2 fx + 2 fy + cx + cy) / 6 of smooth L1 in pixels, intrinsics (V, 3, 3): the published code's term."""
+    error = F.smooth_l1_loss(predicted, prior, reduction="none").mean(0)
+    return (2 * (error[0, 0] + error[1, 1]) + error[0, 2] + error[1, 2]) / 6
+
+
+def _focals(K: Tensor) -> Tensor:
+    return torch.stack([K[..., 0, 0], K[..., 1, 1]], -1)
+
+
+def depth(predicted: Tensor, prior: Tensor, mask: Tensor) -> Tensor:
+    """Mean L1 over the mask after one least-squares scale and shift for all views: the paper's term.
+
+    Differentiable also through the alignment.
+
+    Args:
+        predicted: (V, H, W).
+        prior: (V, H, W), in any unit.
+        mask: (V, H, W) bool, where the prior is known.
+
+    Raises:
+        ValueError: fewer than two masked pixels, or a constant predicted depth.
+    """
+    scale, shift = scale_shift(predicted, prior, mask)
+    return (scale * predicted + shift - prior)[mask].abs().mean()
+
+
+def depth_reference(
+    predicted: Tensor, prior: Tensor, mask: Tensor, confidence: Tensor, quantile: float = 0.0
+) -> Tensor:
+    """Mean over the mask of confidence · L1 − log confidence: the published code's depth term.
+
+    The alignment uses the masked pixels whose confidence is at least this quantile of theirs (the
+    published code has 0.5 in its runs). The other arguments and errors are those of :func:`depth`;
+    ``confidence`` is (V, H, W), at least 1.
+    """
+    if not bool(mask.any()):
+        raise ValueError("the depth prior is empty: no pixel of its mask is set")
+    sure = mask & (confidence >= torch.quantile(confidence[mask].detach(), quantile))
+    scale, shift = scale_shift(predicted, prior, sure)
+    error = (scale * predicted + shift - prior)[mask].abs()
+    return (confidence[mask] * error - confidence[mask].log()).mean()
+
+
+@dataclass(frozen=True)
+class SparseDepthConfig:
+    """The robust penalty on triangulated points."""
+
+    kernel: str = knob(
+        "huber",
+        "Growth with large errors: huber is linear, cauchy logarithmic (for many wrong points).",
+        choices=("huber", "cauchy"),
+    )
+    threshold: float = knob(
+        1.5, "Residual in standard deviations at which the penalty stops being quadratic."
+    )
+    sigma_floor: float = knob(
+        0.005,
+        "Relative depth error that no point is below, added to its own in squares: what the predicted map "
+        "cannot resolve between pixels.",
+    )
+
+
+def robust(residual: Tensor, kernel: str, threshold: float) -> Tensor:
+    """½ r² near zero, with a slower growth beyond ``threshold`` k; any shape.
+
+    huber: k (|r| − k / 2) for |r| > k. cauchy: k² / 2 · log(1 + (r / k)²).
+
+    Raises:
+        ValueError: a kernel that does not exist.
+    """
+    if kernel == "huber":
+        return F.huber_loss(residual, torch.zeros_like(residual), reduction="none", delta=threshold)
+    if kernel == "cauchy":
+        return 0.5 * threshold**2 * torch.log1p((residual / threshold) ** 2)
+    raise ValueError(f"there is no robust kernel {kernel!r}; choose huber or cauchy")
+
+
+def inverse_depth_error(depth: Tensor, sparse: SparseDepth) -> tuple[Tensor, Tensor]:
+    """Relative error (N,) of the inverse depth at N points, z / d(x, y) − 1, and which lie in the map (N,).
+
+    1 / d is sampled bilinearly between pixel centres from the map (H, W), and is constant in the outer
+    half pixel. Inverse depth is linear in the image on a plane, so that this is exact there.
+    """
+    h, w = depth.shape
+    size = sparse.xy.new_tensor([w, h])
+    inside = ((sparse.xy >= 0) & (sparse.xy <= size)).all(-1)
+    xy = torch.minimum(sparse.xy.clamp_min(0.5), size - 0.5)
+    inverse = sample(1 / depth.clamp_min(1e-6)[None, None], xy.unsqueeze(0))[0, 0]
+    return inverse * sparse.depth - 1, inside
+
+
+def sparse_depth(depth: Tensor, points: SparseDepth, config: SparseDepthConfig | None = None) -> Tensor:
+    """Mean robust penalty on the relative inverse depth at triangulated points, in standard deviations.
+
+    With e = z / d − 1 at a point and its σ (with the floor), the penalty is ρ(e / σ): quadratic errors
+    have the weight 1 / σ². The mean (scalar) is over the points that lie in the map.
+
+    Args:
+        depth: (H, W) positive depth of one view, in the unit of the points.
+        points: N triangulated points as this view sees them.
+        config: kernel, threshold and floor.
+
+    Raises:
+        ValueError: no point lies in the map.
+    """
+    config = config or SparseDepthConfig()
+    error, inside = inverse_depth_error(depth, points)
+    if not bool(inside.any()):
+        raise ValueError(
+            f"the sparse depth prior is empty: none of {len(points)} triangulated points is in the view"
+        )
+    sigma = (points.sigma**2 + config.sigma_floor**2).sqrt()
+    return robust(error / sigma, config.kernel, config.threshold)[inside].mean()
