@@ -8,7 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-_SUFFIX = ".unfinished"
+UNFINISHED = ".unfinished"
+"""Part of the names of files that are being written."""
 
 
 @contextmanager
@@ -21,7 +22,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = target.with_name(f".{target.stem}.{os.getpid()}{_SUFFIX}{target.suffix}")
+    unfinished = target.with_name(f".{target.stem}.{os.getpid()}{UNFINISHED}{target.suffix}")
     try:
         yield unfinished
         os.replace(unfinished, target)

@@ -190,7 +190,8 @@ def votes_by_hand(
         seen = (z > 0) & (col >= 0) & (col < shape[1]) & (row >= 0) & (row < shape[0])
         row, col = np.where(seen, row, 0).astype(int), np.where(seen, col, 0).astype(int)
         n, ray = theirs.normal[row, col], np.stack([x / z, y / z, np.ones_like(z)], -1)
-        ratio = (n * rays(shape)[row, col]).sum(-1) / (n * ray).sum(-1)
+        with np.errstate(invalid="ignore"):
+            ratio = (n * rays(shape)[row, col]).sum(-1) / (n * ray).sum(-1)
         surface = theirs.depth[row, col] * np.where((ratio > 1 / 1.05) & (ratio < 1.05), ratio, 1)
         seen &= surface > 0
         off = (surface - z) / z / config.max_depth_error

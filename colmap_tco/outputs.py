@@ -1,0 +1,220 @@
+"""What a dense workspace holds: undistorted images and model, maps, lists of views, cloud, report.
+
+The folder is COLMAP's dense workspace, so that its tools and those of others read it; see
+:class:`colmap_tco.workspace.DensePaths` for the names.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, is_dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_tco import _pycolmap
+from colmap_tco._pycolmap import Model
+from colmap_tco.atomic import atomic_file, write_text
+from colmap_tco.errors import DensifyError
+from colmap_tco.fusion import FusionMaps, FusionView
+from colmap_tco.maps import read_map, write_map
+from colmap_tco.ply import Cloud, write_ply, write_vis
+from colmap_tco.views import View, undistorted_image
+from colmap_tco.workspace import DensePaths, read_image
+
+JPEG_QUALITY = 95
+_DIGITS = 6
+
+
+@dataclass(frozen=True)
+class ViewMaps:
+    """The dense result of one view, in the frame of its undistorted camera.
+
+    Attributes:
+        depth: (H, W) camera z in the units of the model, 0 where there is none.
+        normal: (H, W, 3) unit normals in the camera frame, facing the camera, 0 where there is none.
+        confidence: (H, W) at least 1.
+    """
+
+    depth: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+
+
+def write_view(paths: DensePaths, view: View, maps: ViewMaps) -> None:
+    """Write the undistorted image and the three maps of a view.
+
+    Raises:
+        InputError: the image cannot be read.
+        ValueError: a map holds a value that is not finite.
+    """
+    image, _ = undistorted_image(view)
+    write_image(paths.image(view.name), image)
+    write_map(paths.depth_map(view.name), maps.depth)
+    write_map(paths.normal_map(view.name), maps.normal)
+    write_map(paths.confidence_map(view.name), maps.confidence)
+
+
+def write_image(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write RGB (H, W, 3) atomically, in the format of its extension; JPEG with quality 95.
+
+    Raises:
+        DensifyError: the extension is of a format that cannot be written.
+    """
+    import cv2
+
+    extension = path.suffix.lower()
+    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if extension in (".jpg", ".jpeg") else []
+    pixels = image.mean(2).round().astype(np.uint8) if extension == ".pgm" else image[..., ::-1]
+    try:
+        ok, data = cv2.imencode(extension, np.ascontiguousarray(pixels), options)
+    except cv2.error as error:
+        raise DensifyError(f"{path}: this image format cannot be written ({error.err})") from error
+    if not ok:
+        raise DensifyError(f"{path}: encoding the image failed")
+    with atomic_file(path) as file:
+        file.write(data.tobytes())
+
+
+def undistorted_model(model: Model, views: Sequence[View]) -> Model:
+    """The model of the undistorted images: PINHOLE cameras, the same ids, names and poses, the tracks.
+
+    Observations go through the exact map of the views; those that the distortion cannot be inverted
+    for, or that lie outside the undistorted image, are left out.
+    """
+    images = []
+    entries = {entry.image_id: entry for entry in _pycolmap.registered(model)}
+    for view in views:
+        camera = view.camera
+        xy, points = _pycolmap.observations(model, view.image_id)
+        xy = camera.pixels(_pycolmap.cam_from_img(view.original, xy))
+        with np.errstate(invalid="ignore"):
+            inside = ((xy >= 0) & (xy <= (camera.width, camera.height))).all(1)
+        row = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        images.append(_pycolmap.PinholeImage(entries[view.image_id], row, xy[inside], points[inside]))
+    undistorted = _pycolmap.pinhole_model(images, _pycolmap.points(model))
+    for view in views:
+        undistorted.images[view.image_id].name = view.name  # COLMAP's text format ends a name at a space
+    return undistorted
+
+
+def write_model(paths: DensePaths, model: Model) -> dict[str, int]:
+    """Write the undistorted model in binary.
+
+    Returns:
+        Name → position in ``reg_image_ids()`` of the model as it is read back, which can differ from
+        that of the model in memory. It is how ``fused.ply.vis`` names images.
+    """
+    paths.sparse.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".unfinished", dir=paths.root) as folder:
+        model.write(folder)
+        for file in sorted(Path(folder).iterdir()):
+            os.replace(file, paths.sparse / file.name)
+    return image_positions(paths)
+
+
+def image_positions(paths: DensePaths) -> dict[str, int]:
+    """Name → position in ``reg_image_ids()`` of the undistorted model that was written."""
+    model = _pycolmap.read_model(paths.sparse)
+    return {model.images[key].name: position for position, key in enumerate(model.reg_image_ids())}
+
+
+def write_lists(paths: DensePaths, neighbours: Mapping[str, Sequence[str]]) -> None:
+    """Write ``fusion.cfg`` and ``patch-match.cfg`` and the folder that COLMAP expects beside them.
+
+    Args:
+        paths: the dense workspace.
+        neighbours: name → names of the views that overlap, the best first. The lists are explicit,
+            for OpenMVS reads no others. A name with a comma cannot be in a list and is left out of
+            it; a view without any neighbour is given to COLMAP's own choice.
+    """
+    write_text(paths.fusion_cfg, "".join(f"{name}\n" for name in neighbours))
+    lines = []
+    for name, sources in neighbours.items():
+        listed = [source for source in sources if "," not in source]
+        lines += [name, ", ".join(listed) if listed else "__auto__, 20"]
+    write_text(paths.patch_match_cfg, "".join(f"{line}\n" for line in lines))
+    (paths.stereo / "consistency_graphs").mkdir(parents=True, exist_ok=True)
+
+
+def write_cloud(paths: DensePaths, cloud: Cloud) -> None:
+    """Write ``fused.ply`` and ``fused.ply.vis``."""
+    write_ply(paths.ply, cloud.points, cloud.normals, cloud.colors)
+    write_vis(paths.vis, cloud.visibility)
+
+
+def fusion_views(
+    paths: DensePaths,
+    views: Sequence[View],
+    neighbours: Mapping[str, Sequence[str]],
+    indices: Mapping[str, int],
+) -> list[FusionView]:
+    """The views of a dense workspace for :func:`colmap_tco.fusion.fuse`; arrays are read when needed.
+
+    Args:
+        paths: where :func:`write_view` has written.
+        views: the views to fuse.
+        neighbours: name → names of overlapping views, the best first; others than ``views`` are ignored.
+        indices: as :func:`write_model` returns them.
+    """
+    position = {view.name: i for i, view in enumerate(views)}
+    return [
+        FusionView(
+            name=view.name,
+            index=indices[view.name],
+            camera=view.camera,
+            cam_from_world=view.cam_from_world,
+            neighbours=tuple(position[n] for n in neighbours[view.name] if n in position),
+            load=lambda name=view.name: read_view(paths, name),  # type: ignore[misc]
+        )
+        for view in views
+    ]
+
+
+def read_view(paths: DensePaths, name: str) -> FusionMaps:
+    """The image and maps of a view as :func:`write_view` wrote them.
+
+    Raises:
+        InputError: a file is missing or damaged.
+    """
+    return FusionMaps(
+        depth=read_map(paths.depth_map(name)),
+        normal=read_map(paths.normal_map(name)),
+        image=read_image(paths.image(name)),
+        confidence=read_map(paths.confidence_map(name)),
+    )
+
+
+def write_report(path: Path, report: Mapping[str, object]) -> None:
+    """Write ``report.json``: plain JSON, numbers to six significant digits, null for what is not finite."""
+    import json
+
+    text = json.dumps(plain(report), indent=2, ensure_ascii=False, allow_nan=False)
+    write_text(path, text + "\n")
+
+
+def plain(value: object) -> object:
+    """``value`` as JSON holds it: dataclasses, arrays, paths and numpy numbers resolved, floats rounded.
+
+    Raises:
+        TypeError: a kind of value that has no plain form.
+    """
+    if is_dataclass(value) and not isinstance(value, type):
+        return plain(asdict(value))
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, float):
+        return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, Iterable):
+        return [plain(item) for item in value]
+    raise TypeError(f"{type(value).__name__} has no place in a report")

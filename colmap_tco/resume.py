@@ -1,0 +1,192 @@
+"""The result folder while it is made: resumed after a kill, published when complete, never half there.
+
+Everything is written to ``<workspace>/.dense-tco.partial/`` with atomic files, and its
+``manifest.json`` lists the finished views under a fingerprint of the settings and inputs. A run that
+finds a partial folder with its own fingerprint goes on after the last finished view; one with another
+fingerprint is removed, for it cannot be completed any more. At the end the folder is renamed to
+``dense-tco``. Folders without our manifest are never touched.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import shutil
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from colmap_tco.atomic import UNFINISHED, write_text
+from colmap_tco.errors import InputError
+from colmap_tco.workspace import DensePaths, dense_paths, partial_paths
+
+log = logging.getLogger(__name__)
+
+_MADE_BY = "colmap-tco"
+_FORMAT = 1
+
+
+def fingerprint(settings: Mapping[str, object], contents: Iterable[Path], files: Iterable[Path]) -> str:
+    """A text that changes when the result would.
+
+    Args:
+        settings: everything that decides the result, as JSON can hold it.
+        contents: files whose bytes count (the model, masks).
+        files: files of which name, size and time of change count (images).
+    """
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
+    for path in sorted(contents):
+        digest.update(path.name.encode() + hashlib.sha256(path.read_bytes()).digest())
+    for path in sorted(files):
+        status = path.stat()
+        digest.update(f"{path.name} {status.st_size} {status.st_mtime_ns}\n".encode())
+    return digest.hexdigest()
+
+
+class Result:
+    """The result folder of one workspace, finished or in the making; opened by :func:`open_result`.
+
+    Attributes:
+        paths: where to write, or, if ``finished``, where the result is.
+        finished: True if the published result has this fingerprint: nothing is left to do.
+        views: what was recorded of each finished view, by name.
+    """
+
+    def __init__(
+        self, root: Path, fingerprint: str, finished: bool, views: dict[str, dict[str, object]]
+    ) -> None:
+        self.paths: DensePaths = dense_paths(root) if finished else partial_paths(root)
+        self.finished = finished
+        self.views = views
+        self._root = root
+        self._fingerprint = fingerprint
+
+    def is_done(self, name: str) -> bool:
+        """Whether this view was finished, now or by an earlier run."""
+        return name in self.views
+
+    def mark_done(self, name: str, figures: Mapping[str, object]) -> None:
+        """Record that all files of a view are written, with its figures for the report."""
+        self.views[name] = dict(figures)
+        self._save(complete=False)
+
+    def publish(self) -> DensePaths:
+        """Rename the partial folder to the final one, in the place of an earlier result.
+
+        The earlier result is set aside until the new one is there; a kill in between leaves both, and
+        the next run sorts them out.
+        """
+        final, aside = dense_paths(self._root), _aside(self._root)
+        self._save(complete=True)
+        if final.root.exists():
+            _require_ours(final)
+            os.replace(final.root, aside.root)
+        os.replace(self.paths.root, final.root)
+        if aside.root.exists():
+            shutil.rmtree(aside.root)
+        self.paths, self.finished = final, True
+        return final
+
+    def _save(self, complete: bool) -> None:
+        manifest = {
+            "made_by": _MADE_BY,
+            "format": _FORMAT,
+            "fingerprint": self._fingerprint,
+            "complete": complete,
+            "views": self.views,
+        }
+        write_text(self.paths.manifest, json.dumps(manifest, indent=1, allow_nan=False) + "\n")
+
+
+def open_result(root: Path, fingerprint: str, overwrite: bool = False) -> Result:
+    """Find out what there is to do, and prepare the partial folder for it.
+
+    Args:
+        root: the workspace.
+        fingerprint: of this run's settings and inputs, see :func:`fingerprint`.
+        overwrite: make the result anew even if there is one, and let it replace the one there.
+
+    Raises:
+        InputError: a result of other settings is there and ``overwrite`` is not given; or a folder of
+            that name is there which we did not make.
+    """
+    final, partial, aside = dense_paths(root), partial_paths(root), _aside(root)
+    if aside.root.exists():
+        _restore(final, aside)
+    if final.root.exists():
+        _require_ours(final)
+        same = _read(final).get("fingerprint") == fingerprint
+        if same and not overwrite:
+            log.info("%s is complete and made with these settings: nothing to do", final.root)
+            return Result(root, fingerprint, True, _views(final))
+        if not overwrite:
+            raise InputError(
+                f"{final.root} was made from other inputs or with other settings; give --overwrite to "
+                "replace it, or rename it to keep it"
+            )
+    views = _resume(partial, fingerprint)
+    result = Result(root, fingerprint, False, views)
+    result._save(complete=False)
+    return result
+
+
+def _resume(partial: DensePaths, fingerprint: str) -> dict[str, dict[str, object]]:
+    """The finished views in a partial folder of this fingerprint; any other of ours is removed."""
+    if not partial.root.exists():
+        return {}
+    _require_ours(partial)
+    manifest = _read(partial)
+    if manifest.get("fingerprint") != fingerprint:
+        log.info("%s was begun from other inputs or with other settings: beginning anew", partial.root)
+        shutil.rmtree(partial.root)
+        return {}
+    for unfinished in partial.root.rglob(f".*{UNFINISHED}*"):
+        unfinished.unlink()
+    views = {name: figures for name, figures in _views(partial).items() if _all_there(partial, name)}
+    log.info("%s: going on after %d finished views", partial.root, len(views))
+    return views
+
+
+def _all_there(paths: DensePaths, name: str) -> bool:
+    """Whether every file of a view exists; files are atomic, so that those that exist are whole."""
+    files = (paths.image(name), paths.depth_map(name), paths.normal_map(name), paths.confidence_map(name))
+    return all(file.is_file() for file in files)
+
+
+def _restore(final: DensePaths, aside: DensePaths) -> None:
+    """Undo or finish a replacement that was interrupted between its two renames."""
+    _require_ours(aside)
+    if final.root.exists():
+        shutil.rmtree(aside.root)
+    else:
+        os.replace(aside.root, final.root)
+
+
+def _aside(root: Path) -> DensePaths:
+    """Where an earlier result waits while it is replaced."""
+    return DensePaths(root / ".dense-tco.old")
+
+
+def _require_ours(paths: DensePaths) -> None:
+    """Refuse a folder that holds something but not our manifest: it belongs to the user."""
+    if _read(paths).get("made_by") == _MADE_BY:
+        return
+    if paths.root.is_dir() and all(UNFINISHED in entry.name for entry in paths.root.iterdir()):
+        return
+    raise InputError(f"{paths.root} exists but was not made by {_MADE_BY}; rename it or move it away")
+
+
+def _read(paths: DensePaths) -> dict[str, object]:
+    if not paths.manifest.is_file():
+        return {}
+    try:
+        manifest = json.loads(paths.manifest.read_text("utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError):
+        return {}
+    return manifest if isinstance(manifest, dict) and manifest.get("format") == _FORMAT else {}
+
+
+def _views(paths: DensePaths) -> dict[str, dict[str, object]]:
+    views = _read(paths).get("views")
+    return dict(views) if isinstance(views, dict) else {}
