@@ -53,17 +53,12 @@ class ObjectiveConfig:
     constant_weights: bool = knob(
         False, "No gradient through alpha in the weights, so that surfels cannot fade to lower the loss."
     )
-    include_source: bool = knob(
-        False, "Whether the source view is among its own targets, as in the published code."
-    )
     renderer: str = knob("cpu", "Engine that renders the surfels.", choices=("cpu", "gsplat", "twin"))
 
     @classmethod
     def reference(cls) -> ObjectiveConfig:
-        """The settings that reproduce the published code."""
-        return cls(
-            occlusion_tolerance=0.0, occlusion_of_mean=1e-4, unpremultiply=False, include_source=True
-        )  # fmt: skip
+        """The settings that reproduce the published code, which also has the source among its targets."""
+        return cls(occlusion_tolerance=0.0, occlusion_of_mean=1e-4, unpremultiply=False)
 
 
 def photometric(

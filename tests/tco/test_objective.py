@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,24 +11,44 @@ import pytest
 import torch
 from torch import Tensor
 
-from tco.geometry import rigid, skew, so3_exp
+from tco.geometry import skew
 from tco.objective import (
     NothingVisibleError,
     ObjectiveConfig,
-    Targets,
+    color_difference,
+    consistency,
+    depth_difference,
     geometric,
     match_exposure,
     photometric,
     weights,
 )
-from tco.render import Rendered, render
+from tco.render import Rendered
 from tco.surfels import SurfelConfig, from_depth
-from tco.types import Cameras
+from tco.types import Cameras, Prediction
 
 PARITY = Path(__file__).parents[3] / "shared" / "parity"
 F64 = torch.float64
 T, H, W = 2, 12, 16
 PLAIN = ObjectiveConfig(occlusion_tolerance=0.0, unpremultiply=False)
+
+
+@dataclass(frozen=True)
+class Targets:
+    images: Tensor
+    depth: Tensor
+    valid: Tensor | None = None
+
+
+def colors(rendered: Rendered, targets: Targets, config: ObjectiveConfig | None = None) -> Tensor:
+    config = config or ObjectiveConfig()
+    weight = weights(rendered, targets.depth, targets.valid, config)
+    return color_difference(rendered, targets.images, weight, config)
+
+
+def depths(rendered: Rendered, targets: Targets, config: ObjectiveConfig | None = None) -> Tensor:
+    weight = weights(rendered, targets.depth, targets.valid, config or ObjectiveConfig())
+    return depth_difference(rendered, targets.depth, weight)
 
 
 def scene() -> tuple[Rendered, Targets]:
@@ -39,8 +59,7 @@ def scene() -> tuple[Rendered, Targets]:
 
     alpha = 0.2 + 0.7 * rand(T, H, W)
     depth = 1 + rand(T, H, W)
-    eye = torch.eye(4, dtype=F64).expand(T, 4, 4)
-    targets = Targets(rand(T, 3, H, W), Cameras(eye, eye[:, :3, :3]), depth + 0.1)
+    targets = Targets(rand(T, 3, H, W), depth + 0.1)
     return Rendered(rand(T, H, W, 3) * alpha.unsqueeze(-1), depth, alpha), targets
 
 
@@ -49,7 +68,7 @@ def test_photometric_is_the_weighted_mean_of_l1() -> None:
     image = targets.images.permute(0, 2, 3, 1)
     error = (rendered.color - image).abs().mean(-1)
     expected = (rendered.alpha * error).sum() / rendered.alpha.sum()
-    torch.testing.assert_close(photometric(rendered, targets, PLAIN), expected)
+    torch.testing.assert_close(colors(rendered, targets, PLAIN), expected)
 
 
 def test_a_perfect_rendering_costs_nothing() -> None:
@@ -57,9 +76,9 @@ def test_a_perfect_rendering_costs_nothing() -> None:
     image = targets.images.permute(0, 2, 3, 1)
     perfect = Rendered(image * rendered.alpha.unsqueeze(-1), targets.depth, rendered.alpha)
     for config in (ObjectiveConfig(), ObjectiveConfig(exposure=True, structure=0.85)):
-        assert float(photometric(perfect, targets, config)) == pytest.approx(0, abs=1e-9)
-    assert float(geometric(perfect, targets)) == 0
-    assert float(photometric(perfect, targets, PLAIN)) > 0.05  # transparency is taken for darkness
+        assert float(colors(perfect, targets, config)) == pytest.approx(0, abs=1e-9)
+    assert float(depths(perfect, targets)) == 0
+    assert float(colors(perfect, targets, PLAIN)) > 0.05  # transparency is taken for darkness
 
 
 def test_geometric_of_a_tilted_plane() -> None:
@@ -68,7 +87,7 @@ def test_geometric_of_a_tilted_plane() -> None:
     x = torch.arange(W, dtype=F64).expand(T, H, W)
     config = ObjectiveConfig(occlusion_tolerance=10.0)
     tilted = Rendered(rendered.color, targets.depth + 0.1 * x, torch.ones(T, H, W, dtype=F64))
-    assert float(geometric(tilted, targets, config)) == pytest.approx(0.1 * (W - 1) / 2 + 0.1)
+    assert float(depths(tilted, targets, config)) == pytest.approx(0.1 * (W - 1) / 2 + 0.1)
 
 
 def test_occluded_pixels_do_not_count() -> None:
@@ -77,12 +96,12 @@ def test_occluded_pixels_do_not_count() -> None:
     ratio = torch.tensor([0.5, 0.99, 1.0, 1.019, 1.021, 3.0], dtype=F64)
     depth = targets.depth.clone()
     depth[0, 0, :6] *= ratio
-    weight = weights(Rendered(rendered.color, depth, rendered.alpha), targets, ObjectiveConfig())
+    weight = weights(Rendered(rendered.color, depth, rendered.alpha), targets.depth, None, ObjectiveConfig())
     assert (weight[0, 0, :6] > 0).tolist() == [True, True, True, True, False, False]
     mean = float(targets.depth.mean())
     config = ObjectiveConfig(occlusion_tolerance=0.0, occlusion_of_mean=0.1)
     depth = targets.depth + torch.where(torch.arange(W) % 2 == 0, 0.099, 0.101) * mean
-    weight = weights(Rendered(rendered.color, depth, rendered.alpha), targets, config)
+    weight = weights(Rendered(rendered.color, depth, rendered.alpha), targets.depth, None, config)
     assert bool((weight[..., 0::2] > 0).all()) and not bool(weight[..., 1::2].any())
 
 
@@ -92,21 +111,17 @@ def test_pixels_outside_the_mask_have_no_influence() -> None:
     masked = replace(targets, valid=valid)
     changed = replace(masked, images=torch.where(valid.unsqueeze(1), targets.images, 0.5))
     for config in (PLAIN, ObjectiveConfig(exposure=True)):
-        torch.testing.assert_close(
-            photometric(rendered, masked, config), photometric(rendered, changed, config)
-        )
+        torch.testing.assert_close(colors(rendered, masked, config), colors(rendered, changed, config))
     # A window of SSIM sees the target's own pixels in the place of those without weight.
     structure = ObjectiveConfig(structure=1.0)
     everywhere = replace(rendered, color=torch.where(valid.unsqueeze(-1), rendered.color, 9.0))
-    torch.testing.assert_close(
-        photometric(rendered, masked, structure), photometric(everywhere, masked, structure)
-    )
+    torch.testing.assert_close(colors(rendered, masked, structure), colors(everywhere, masked, structure))
 
 
 def test_nothing_visible_is_an_error() -> None:
     rendered, targets = scene()
     nothing = Rendered(rendered.color, rendered.depth * 0, rendered.alpha * 0)
-    for term in (photometric, geometric):
+    for term in (colors, depths):
         with pytest.raises(NothingVisibleError, match="sees the surfels"):
             term(nothing, targets)
         with pytest.raises(NothingVisibleError):
@@ -123,8 +138,8 @@ def test_exposure_is_recovered_exactly_and_makes_the_term_invariant() -> None:
     torch.testing.assert_close(b, bias, atol=2e-3, rtol=0)
     same = replace(targets, images=(gain * color + bias).permute(0, 3, 1, 2))
     picture = replace(rendered, color=color * rendered.alpha.unsqueeze(-1))
-    assert float(photometric(picture, same, ObjectiveConfig())) > 0.1
-    assert float(photometric(picture, same, ObjectiveConfig(exposure=True))) < 1e-3
+    assert float(colors(picture, same, ObjectiveConfig())) > 0.1
+    assert float(colors(picture, same, ObjectiveConfig(exposure=True))) < 1e-3
 
 
 def test_gain_does_not_reward_misalignment() -> None:
@@ -140,8 +155,8 @@ def test_structure_ignores_a_small_shift_of_brightness_more_than_l1() -> None:
     brighter = replace(rendered, color=(image + 0.05) * rendered.alpha.unsqueeze(-1))
     scrambled = replace(rendered, color=image.flip(1) * rendered.alpha.unsqueeze(-1))
     ssim, l1 = ObjectiveConfig(structure=1.0), ObjectiveConfig()
-    ratio_ssim = photometric(brighter, targets, ssim) / photometric(scrambled, targets, ssim)
-    ratio_l1 = photometric(brighter, targets, l1) / photometric(scrambled, targets, l1)
+    ratio_ssim = colors(brighter, targets, ssim) / colors(scrambled, targets, ssim)
+    ratio_l1 = colors(brighter, targets, l1) / colors(scrambled, targets, l1)
     assert float(ratio_ssim) < 0.25 * float(ratio_l1)
 
 
@@ -157,11 +172,11 @@ def test_derivatives_match_finite_differences(config: ObjectiveConfig) -> None:
     rendered, targets = scene()
     small = (slice(None), slice(4), slice(5))
     leaves = [t[small].clone().requires_grad_(True) for t in (rendered.color, rendered.depth, rendered.alpha)]
-    cut = Targets(targets.images[..., :4, :5], targets.cameras, targets.depth[small])
+    cut = Targets(targets.images[..., :4, :5], targets.depth[small])
     # The moments of exposure are taken with the weights as constants, and so are left out for alpha.
     leaves[2].requires_grad_(not config.exposure)
-    assert torch.autograd.gradcheck(lambda c, d, a: photometric(Rendered(c, d, a), cut, config), leaves)
-    assert torch.autograd.gradcheck(lambda c, d, a: geometric(Rendered(c, d, a), cut, config), leaves)
+    assert torch.autograd.gradcheck(lambda c, d, a: colors(Rendered(c, d, a), cut, config), leaves)
+    assert torch.autograd.gradcheck(lambda c, d, a: depths(Rendered(c, d, a), cut, config), leaves)
 
 
 def test_constant_weights_have_no_derivative() -> None:
@@ -169,9 +184,60 @@ def test_constant_weights_have_no_derivative() -> None:
     alpha = rendered.alpha.clone().requires_grad_(True)
     given = Rendered(rendered.color, rendered.depth, alpha)
     config = replace(PLAIN, constant_weights=True)
-    assert not photometric(given, targets, config).requires_grad
-    photometric(given, targets, PLAIN).backward()
+    assert not colors(given, targets, config).requires_grad
+    colors(given, targets, PLAIN).backward()
     assert alpha.grad is not None and bool(alpha.grad.any())
+
+
+def two_views_of_a_wall(distance: float) -> tuple[Tensor, Cameras, Prediction]:
+    """Depth of a frontal wall in the first view, two cameras, and the second's exact prediction."""
+    K = torch.tensor([[30.0, 0, 16], [0, 30.0, 12], [0, 0, 1]], dtype=F64).expand(2, 3, 3)
+    pose = torch.eye(4, dtype=F64).repeat(2, 1, 1)
+    pose[1, :3, 3] = torch.tensor([0.2, 0.05, 0.5])
+    depth = torch.tensor([distance, distance - 0.5], dtype=F64)[:, None, None].expand(2, 24, 32)
+    return depth[0], Cameras(pose, K), Prediction(depth, 2 * torch.ones_like(depth), Cameras(pose, K), (0, 1))
+
+
+def test_consistency_of_agreeing_depths_is_zero_and_grows_with_the_error() -> None:
+    depth, cameras, context = two_views_of_a_wall(2.0)
+    assert float(consistency(depth, cameras, 0, [1], context)) == pytest.approx(0, abs=1e-12)
+    # 1 % more depth is 2.02 − 0.5 against 1.5: e = 0.02 / 1.5.
+    expected = 0.02 * np.log1p(0.02 / 1.5 / 0.02)
+    assert float(consistency(1.01 * depth, cameras, 0, [1], context)) == pytest.approx(expected)
+
+
+def test_consistency_is_indifferent_to_occlusions() -> None:
+    """A wall far behind what the target sees pulls at a hundredth of the force of a small error."""
+    depth, cameras, context = two_views_of_a_wall(2.0)
+    forces = []
+    for factor in (1.001, 5.0):
+        leaf = (factor * depth).requires_grad_(True)
+        consistency(leaf, cameras, 0, [1], context).backward()
+        assert leaf.grad is not None
+        forces.append(float(leaf.grad.abs().max()))
+    assert forces[1] < 0.02 * forces[0]
+
+
+def test_consistency_without_overlap_is_an_error() -> None:
+    depth, cameras, context = two_views_of_a_wall(2.0)
+    pose = cameras.world_from_cam.clone()
+    pose[1, :3, 3] = torch.tensor([100.0, 0, 0])
+    with pytest.raises(NothingVisibleError, match="view 0"):
+        consistency(depth, Cameras(pose, cameras.K), 0, [1], context)
+
+
+def test_derivatives_of_consistency_match_finite_differences() -> None:
+    depth, cameras, context = two_views_of_a_wall(2.0)
+    bumpy = depth + 0.05 * torch.rand(24, 32, generator=torch.Generator().manual_seed(0), dtype=F64)
+    scale = torch.ones((), dtype=F64, requires_grad=True)
+    shift = torch.zeros(3, dtype=F64, requires_grad=True)
+
+    def f(scale: Tensor, shift: Tensor) -> Tensor:
+        pose = cameras.world_from_cam.clone()
+        pose[0, :3, 3] = shift
+        return consistency(scale * bumpy, Cameras(pose, cameras.K * scale), 0, [1], context)
+
+    assert torch.autograd.gradcheck(f, (scale, shift), eps=1e-8, atol=1e-5)
 
 
 def _tangent(gradient: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
@@ -198,11 +264,12 @@ def test_parity_with_the_published_code(term: str) -> None:
         config=SurfelConfig(pixel_centre=0.0),
     )
     cameras = Cameras(pose, data["K"])
-    targets = Targets(data["images"], cameras, depth)
-    loss = {"photo": photometric, "geom": geometric}[term](
-        render(surfels, cameras, targets.size), targets, ObjectiveConfig.reference()
-    )
-    assert float(loss) == pytest.approx(expected, rel=1e-5)
+    config = ObjectiveConfig.reference()
+    if term == "photo":
+        loss = photometric(surfels, data["images"], cameras, depth, config=config)
+    else:
+        loss = geometric(surfels, cameras, depth, config=config)
+    assert loss.item() == pytest.approx(expected, rel=1e-5)
     loss.backward()
     assert depth.grad is not None and pose.grad is not None
     by_depth = data[f"{term}_grad_depth"]
