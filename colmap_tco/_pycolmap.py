@@ -76,6 +76,10 @@ def read_model(path: Path) -> Model:
     missing = [name + suffix for name in MODEL_FILES if not (path / (name + suffix)).is_file()]
     if missing:
         raise InputError(f"{path}: {', '.join(missing)} missing; a COLMAP model needs all of {MODEL_FILES}")
+    if suffix == ".bin":
+        for name, ends_early in (("images", _images_end_early), ("points3D", _points_end_early)):
+            if ends_early((path / f"{name}.bin").read_bytes()):
+                raise InputError(_broken(path, suffix, f"{name}.bin ends before its last entry"))
     try:
         model = load().Reconstruction(str(path))
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as error:
@@ -96,6 +100,31 @@ def _broken(path: Path, suffix: str, cause: str) -> str:
         f"{path}: not readable as a COLMAP model, probably a truncated or interrupted copy "
         f"({cause}; {sizes}). Copy or export the model again."
     )
+
+
+def _images_end_early(data: bytes) -> bool:
+    """Whether images.bin is shorter than its counts say (``scene/reconstruction_io_binary.cc``).
+
+    COLMAP's reader does not look: on a cut points3D.bin it allocates until the memory is full.
+    """
+    at = 8
+    for _ in range(int.from_bytes(data[:8], "little") if len(data) >= 8 else 1):
+        at = data.find(b"\0", at + 64) + 1  # id, quaternion, translation and camera, then the name
+        if not 0 < at <= len(data) - 8:
+            return True
+        at += 8 + 24 * int.from_bytes(data[at : at + 8], "little")
+    return at > len(data)
+
+
+def _points_end_early(data: bytes) -> bool:
+    """Whether points3D.bin is shorter than its counts say."""
+    at = 8
+    for _ in range(int.from_bytes(data[:8], "little") if len(data) >= 8 else 1):
+        at += 51  # id, position, colour, error and track length, then the track
+        if at > len(data):
+            return True
+        at += 8 * int.from_bytes(data[at - 8 : at], "little")
+    return at > len(data)
 
 
 def _plausible(camera: Camera) -> bool:

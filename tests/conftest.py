@@ -1,0 +1,172 @@
+"""Fixtures for all tests: the data beside the repository, and small workspaces made on the spot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from colmap_tco import _pycolmap
+
+_pycolmap.load()  # in the order that keeps PNG writing alive, before any test module imports pycolmap
+
+DISTORTIONS = {
+    "SIMPLE_PINHOLE": [],
+    "PINHOLE": [],
+    "SIMPLE_RADIAL": [-0.15],
+    "RADIAL": [0.12, -0.05],
+    "OPENCV": [-0.2, 0.05, 0.002, -0.003],
+    "FULL_OPENCV": [-0.2, 0.05, 0.002, -0.003, 0.01, 0.01, 0.0, 0.0],
+    "SIMPLE_RADIAL_FISHEYE": [-0.02],
+    "RADIAL_FISHEYE": [0.01, -0.01],
+    "OPENCV_FISHEYE": [0.01, -0.01, 0.001, 0.0],
+    "FOV": [0.8],
+    "THIN_PRISM_FISHEYE": [0.01, -0.01, 0.001, 0.001, 0.0, 0.0, 0.001, 0.001],
+}
+"""Every distorting camera model that all supported versions of pycolmap know, with telling parameters."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A camera of a made-up workspace.
+
+    Attributes:
+        size: (width, height).
+        model: COLMAP's name.
+        params: of that model; empty: a focal length of 0.9 widths and a centre off the middle.
+    """
+
+    size: tuple[int, int] = (160, 120)
+    model: str = "SIMPLE_RADIAL"
+    params: tuple[float, ...] = field(default=())
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder of real workspaces and reference numbers beside the repository; read only."""
+    folder = Path(__file__).resolve().parents[2] / "shared"
+    if not (folder / "data").is_dir():
+        pytest.skip("the data folder ../shared is not there")
+    return folder
+
+
+def colmap_camera(shot: Shot) -> _pycolmap.Camera:
+    """A pycolmap camera as described, off-centre unless parameters are given."""
+    pycolmap = _pycolmap.load()
+    width, height = shot.size
+    camera = pycolmap.Camera(
+        model=shot.model,
+        width=width,
+        height=height,
+        params=shot.params or default_params(shot.model, width, height),
+    )
+    camera.camera_id = 1
+    return camera
+
+
+def default_params(model: str, width: int, height: int) -> list[float]:
+    """A focal length of 0.9 widths, the principal point off the middle, and the model's distortion."""
+    focal = [0.9 * max(width, height)]
+    if not (model.startswith("SIMPLE") or model in ("RADIAL", "RADIAL_FISHEYE")):
+        focal.append(focal[0] * 1.02)
+    return [*focal, width / 2 + 3.3, height / 2 - 2.7, *DISTORTIONS[model]]
+
+
+@pytest.fixture(scope="session")
+def make_camera() -> Callable[..., _pycolmap.Camera]:
+    """A function that makes a pycolmap camera from the fields of :class:`Shot`."""
+    return lambda **fields: colmap_camera(Shot(**fields))
+
+
+def look_at(centre: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """cam_from_world (3, 4) of a camera at ``centre`` that looks at ``target``, y down."""
+    z = target - centre
+    z /= np.linalg.norm(z)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    R = np.stack([x, np.cross(z, x), z])
+    return np.concatenate([R, -R @ centre[:, None]], 1)
+
+
+def write_text_model(
+    folder: Path, shots: Sequence[Shot], poses: np.ndarray, xyz: np.ndarray, noise: float, names: list[str]
+) -> None:
+    """COLMAP's text format, written independently of the package; every camera sees what is before it."""
+    pycolmap = _pycolmap.load()
+    rng = np.random.default_rng(5)
+    folder.mkdir(parents=True)
+    cameras, images = [], []
+    tracks: list[list[str]] = [[] for _ in xyz]
+    for i, (shot, pose) in enumerate(zip(shots, poses, strict=True), 1):
+        camera = colmap_camera(shot)
+        params = " ".join(repr(float(value)) for value in camera.params)
+        cameras.append(f"{i} {shot.model} {camera.width} {camera.height} {params}")
+        local = xyz @ pose[:, :3].T + pose[:, 3]
+        uv = np.asarray(camera.img_from_cam(local / local[:, 2:])) + noise * rng.normal(size=(len(xyz), 2))
+        seen = np.flatnonzero((local[:, 2] > 0.1) & (uv > 0).all(1) & (uv < shot.size).all(1))
+        for index, point in enumerate(seen):
+            tracks[point].append(f"{i} {index}")
+        q = pycolmap.Rotation3d(np.ascontiguousarray(pose[:, :3])).quat
+        pose_text = " ".join(repr(float(v)) for v in [q[3], q[0], q[1], q[2], *pose[:, 3]])
+        points = " ".join(f"{float(uv[p, 0])!r} {float(uv[p, 1])!r} {p + 1}" for p in seen)
+        images.append(f"{i} {pose_text} {i} {names[i - 1]}\n{points}")
+    points = [
+        f"{p + 1} {' '.join(repr(float(v)) for v in xyz[p])} 200 100 50 0.5 {' '.join(track)}"
+        for p, track in enumerate(tracks)
+        if track
+    ]
+    for name, lines in (("cameras", cameras), ("images", images), ("points3D", points)):
+        (folder / f"{name}.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+@pytest.fixture(scope="session")
+def make_workspace() -> Callable[..., Path]:
+    """A function that writes a workspace: noise pictures, cameras on an arc, points on a wavy wall.
+
+    Arguments: the folder; ``shots``; ``points``, their number; ``origin``, added to all coordinates;
+    ``noise`` of keypoints in pixels; ``names`` of the images; ``sparse``, the folder of the model.
+    """
+
+    def make(
+        root: Path,
+        shots: Sequence[Shot] = (Shot(),) * 5,
+        points: int = 150,
+        origin: Sequence[float] = (0.0, 0.0, 0.0),
+        noise: float = 0.0,
+        names: list[str] | None = None,
+        sparse: str = "sparse/0",
+    ) -> Path:
+        import cv2
+
+        rng = np.random.default_rng(3)
+        names = names or [f"{i:03d}.png" for i in range(len(shots))]
+        xy = rng.uniform(-1.6, 1.6, (points, 2))
+        xyz = np.concatenate([xy, 4 + 0.4 * np.sin(3 * xy[:, :1])], 1) + origin
+        centres = [np.array([x, 0.1 * x * x, 0.0]) + origin for x in np.linspace(-0.8, 0.8, len(shots))]
+        target = np.array([0.0, 0.0, 4.0]) + origin
+        poses = np.stack([look_at(centre, target) for centre in centres])
+        write_text_model(root / sparse, shots, poses, xyz, noise, names)
+        for shot, name in zip(shots, names, strict=True):
+            path = root / "images" / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            width, height = shot.size
+            small = rng.integers(0, 256, (height // 8, width // 8, 3), dtype=np.uint8)
+            cv2.imwrite(str(path), cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC))
+        return root
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def shot() -> type[Shot]:
+    """The class that describes a camera of a made-up workspace."""
+    return Shot
+
+
+@pytest.fixture(scope="session")
+def workspace_folder(tmp_path_factory: pytest.TempPathFactory, make_workspace: Callable[..., Path]) -> Path:
+    """A small workspace of five views, for tests that only read."""
+    return make_workspace(tmp_path_factory.mktemp("synthetic"), noise=0.2)
