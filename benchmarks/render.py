@@ -70,12 +70,14 @@ def main() -> None:
         torch.set_num_threads(threads)
         small = sum(best(step(24, 32, 1, "twin"), 1))
         twin = small * (240 * 320 / (24 * 32)) ** 2 * 7
-        forward, backward = best(step(240, 320, 7), args.repeat)
-        print(
-            f"{threads} thread(s): 76,800 surfels into 7 views of 320×240: forward {forward:.3f} s, backward "
-            f"{backward:.3f} s, together {forward + backward:.3f} s; twin extrapolated {twin:.0f} s, "
-            f"ratio {twin / (forward + backward):.0f}"
-        )
+        for engine in ("cpu", "surface"):
+            forward, backward = best(step(240, 320, 7, engine), args.repeat)
+            total = forward + backward
+            print(
+                f"{threads} thread(s), {engine}: 76,800 surfels into 7 views of 320×240: {total:.3f} s "
+                f"(forward {forward:.3f}, backward {backward:.3f}); "
+                f"brute force, extrapolated: {twin:.0f} s, {twin / total:.0f} times as much"
+            )
         for height, width in ((60, 80), (120, 160), (240, 320), (480, 640)):
             seconds = sum(best(step(height, width, 2), args.repeat))
             n = height * width

@@ -5,6 +5,11 @@ sigma = ½ min(a² + b², 2 |Δ|²) with (a, b) the hit of the ray in units of t
 pixels from the centre of the projected 1σ ellipse; alpha = min(0.99, opacity · exp(−sigma)), skipped
 below 1/255. Surfels are composited by the depth of their centres, and a pixel is finished before its
 transmittance would fall to 1e-4.
+
+Compositing is biased where surfels overlap, as those of neighbouring pixels do: the nearer one hides its
+neighbour, so that a slanted surface is seen moved by up to half a pixel, the more so the more opaque
+the surfels are. The engine ``surface`` averages the surfels of the nearest surface instead, which does
+not move them.
 """
 
 from __future__ import annotations
@@ -52,6 +57,16 @@ def _cpu(
     return rasterize(project(surfels, cameras, size, near), size)
 
 
+def _surface(
+    surfels: Surfels, cameras: Cameras, size: tuple[int, int], near: float = 0.01
+) -> tuple[Tensor, Tensor, Tensor]:
+    from tco.render.cpu import rasterize_surface
+    from tco.render.project import project
+
+    focal = (cameras.K[:, 0, 0] * cameras.K[:, 1, 1]).sqrt()
+    return rasterize_surface(project(surfels, cameras, size, near), focal, size)
+
+
 def _gsplat(
     surfels: Surfels, cameras: Cameras, size: tuple[int, int], near: float = 0.01
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -68,8 +83,22 @@ def _twin(
     return render_twin(surfels, cameras, size, near)
 
 
-ENGINES: dict[str, Engine] = {"cpu": _cpu, "gsplat": _gsplat, "twin": _twin}
-"""``cpu``: numba threads, any device. ``gsplat``: CUDA. ``twin``: brute force, for tests."""
+def _surface_twin(
+    surfels: Surfels, cameras: Cameras, size: tuple[int, int], near: float = 0.01
+) -> tuple[Tensor, Tensor, Tensor]:
+    from tco.render.twin import render_surface_twin
+
+    return render_surface_twin(surfels, cameras, size, near)
+
+
+ENGINES: dict[str, Engine] = {
+    "cpu": _cpu,
+    "surface": _surface,
+    "gsplat": _gsplat,
+    "twin": _twin,
+    "surface_twin": _surface_twin,
+}
+"""``cpu`` and ``surface``: CPU threads, any device. ``gsplat``: CUDA. The twins: brute force, for tests."""
 
 
 def render(

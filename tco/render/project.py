@@ -14,15 +14,9 @@ import torch
 from torch import Tensor
 
 from tco.geometry import invert, matrix_from_quat
+from tco.render.kernels import MIN_ALPHA
 from tco.surfels import Surfels
 from tco.types import Cameras
-
-MIN_ALPHA = 1 / 255
-"""A surfel that contributes less to a pixel is skipped there."""
-MAX_ALPHA = 0.99
-"""No surfel hides what is behind it completely."""
-MIN_TRANSMITTANCE = 1e-4
-"""A pixel is finished before the surfel that would take its transmittance to this or below."""
 
 
 @dataclass(frozen=True)

@@ -1,39 +1,79 @@
 """The definition of the renderer, plain and slow: every surfel on every pixel in float64.
 
 Tests compare the fast engines with it. It shares no code with them: a surfel is intersected with the
-ray of each pixel in camera coordinates, and weights are products over the sorted surfels.
+ray of each pixel in camera coordinates, and the weights of a pixel are computed for all surfels at once.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from tco.geometry import invert, matrix_from_quat, pixel_grid, rays, transform
-from tco.render.project import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from tco.render.kernels import CORE, MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from tco.surfels import Surfels
 from tco.types import Cameras
 
+Images = tuple[Tensor, Tensor, Tensor]
 
-def render_twin(
-    surfels: Surfels, cameras: Cameras, size: tuple[int, int], near: float = 0.01
-) -> tuple[Tensor, Tensor, Tensor]:
+
+def render_twin(surfels: Surfels, cameras: Cameras, size: tuple[int, int], near: float = 0.01) -> Images:
     """Colour (T, H, W, 3), sum of weighted depths (T, H, W) and alpha (T, H, W), in float64.
 
     Memory and time grow with surfels × pixels; a few hundred of the one and a few thousand of the other
     are fine.
     """
+    return _render(_composited, surfels, cameras, size, near)
+
+
+def render_surface_twin(
+    surfels: Surfels, cameras: Cameras, size: tuple[int, int], near: float = 0.01
+) -> Images:
+    """As :func:`render_twin`, for the engine that averages over the nearest surface."""
+    return _render(_averaged, surfels, cameras, size, near)
+
+
+def _composited(sigma: Tensor, opacities: Tensor, depths: Tensor, focal: Tensor) -> Tensor:
+    """Weights (P, N) of sorted surfels: alpha times the transmittance before, until the pixel is finished."""
+    alpha = (opacities * torch.exp(-sigma)).clamp_max(MAX_ALPHA)
+    alpha = torch.where(alpha < MIN_ALPHA, torch.zeros_like(alpha), alpha)
+    after = torch.cumprod(1 - alpha, -1)
+    before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], -1)
+    return torch.where(after > MIN_TRANSMITTANCE, alpha * before, torch.zeros_like(alpha))
+
+
+def _averaged(sigma: Tensor, opacities: Tensor, depths: Tensor, focal: Tensor) -> Tensor:
+    """Weights (P, N) of the surfels of the nearest surface, with the sum 1 − exp(−Σ o · exp(−sigma))."""
+    weight = opacities * torch.exp(-sigma)
+    core = torch.where(sigma <= CORE, depths.expand_as(sigma), torch.inf)
+    surface = torch.cat([core, core.new_full((len(core), 1), torch.inf)], -1).amin(-1, keepdim=True).detach()
+    same = (depths - surface).abs() < (0.01 + 4 / focal.detach()) * surface
+    weight = torch.where((weight < MIN_ALPHA) | ~same, torch.zeros_like(weight), weight)
+    total = weight.sum(-1, keepdim=True)
+    return weight * ((1 - torch.exp(-total)) / total.clamp_min(1e-10))
+
+
+def _render(
+    weigh: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor],
+    surfels: Surfels, cameras: Cameras, size: tuple[int, int], near: float,
+) -> Images:  # fmt: skip
     surfels, cameras = surfels.to(dtype=torch.float64), cameras.to(dtype=torch.float64)
-    views = [
-        _view(surfels, pose, K, size, near) for pose, K in zip(cameras.world_from_cam, cameras.K, strict=True)
-    ]
+    pixels = pixel_grid(*size, surfels.means).reshape(-1, 2)
+    views = []
+    for pose, K in zip(cameras.world_from_cam, cameras.K, strict=True):
+        seen, centres, frame = _in_front(surfels, pose, near)
+        sigma = _sigmas(centres, frame, surfels.scales[seen], pixels, K)
+        weight = weigh(sigma, surfels.opacities[seen], centres[:, 2], (K[0, 0] * K[1, 1]).sqrt())
+        parts = weight @ surfels.colors[seen], weight @ centres[:, 2], weight.sum(-1)
+        views.append([part.reshape(*size, *part.shape[1:]) for part in parts])
     color, depth, alpha = (torch.stack(parts) for parts in zip(*views, strict=True))
     return color, depth, alpha
 
 
-def _view(
-    surfels: Surfels, world_from_cam: Tensor, K: Tensor, size: tuple[int, int], near: float
-) -> tuple[Tensor, Tensor, Tensor]:
+def _in_front(surfels: Surfels, world_from_cam: Tensor, near: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Indices of the surfels that a camera sees by depth, their centres (N, 3) and frames (N, 3, 3) in it."""
     cam_from_world = invert(world_from_cam)
     centres = transform(cam_from_world, surfels.means)
     frame = cam_from_world[:3, :3] @ matrix_from_quat(surfels.quats)
@@ -42,18 +82,11 @@ def _view(
     seen = (centres[:, 2] > near) & (centres[:, 2] > reach)
     order = torch.argsort(centres[:, 2], stable=True)
     order = order[seen[order]]
-    pixels = pixel_grid(*size, centres).reshape(-1, 2)
-    alpha = _alphas(centres[order], frame[order], surfels.scales[order], surfels.opacities[order], pixels, K)
-    weight = _weights(alpha)
-    color = (weight @ surfels.colors[order]).reshape(*size, 3)
-    depth = (weight @ centres[order, 2]).reshape(size)
-    return color, depth, weight.sum(-1).reshape(size)
+    return order, centres[order], frame[order]
 
 
-def _alphas(
-    centres: Tensor, frame: Tensor, scales: Tensor, opacities: Tensor, pixels: Tensor, K: Tensor
-) -> Tensor:
-    """Alpha (P, N) of N sorted surfels (camera frame) at P pixels."""
+def _sigmas(centres: Tensor, frame: Tensor, scales: Tensor, pixels: Tensor, K: Tensor) -> Tensor:
+    """Sigma (P, N) of N surfels (camera frame) at P pixels."""
     ray = rays(pixels, K)
     normal = frame[..., 2]
     slope = ray @ normal.T
@@ -61,9 +94,7 @@ def _alphas(
     hit = ray.unsqueeze(1) * ((centres * normal).sum(-1) / slope).unsqueeze(-1)
     uv = torch.einsum("pnc,nck->pnk", hit - centres, frame[..., :2]) / scales
     offset = pixels.unsqueeze(1) - _ellipse_centres(centres, frame[..., :2] * scales.unsqueeze(-2), K)
-    sigma = 0.5 * torch.minimum((uv**2).sum(-1), 2 * (offset**2).sum(-1))
-    alpha = (opacities * torch.exp(-sigma)).clamp_max(MAX_ALPHA)
-    return torch.where(alpha < MIN_ALPHA, torch.zeros_like(alpha), alpha)
+    return 0.5 * torch.minimum((uv**2).sum(-1), 2 * (offset**2).sum(-1))
 
 
 def _ellipse_centres(centres: Tensor, axes: Tensor, K: Tensor) -> Tensor:
@@ -74,10 +105,3 @@ def _ellipse_centres(centres: Tensor, axes: Tensor, K: Tensor) -> Tensor:
     quadric = centres.unsqueeze(-1) * centres.unsqueeze(-2) - axes @ axes.transpose(-1, -2)
     image = K @ quadric @ K.T
     return image[:, :2, 2] / image[:, 2:, 2]
-
-
-def _weights(alpha: Tensor) -> Tensor:
-    """Weights (P, N) of sorted alphas: alpha times the transmittance before, until the pixel is finished."""
-    after = torch.cumprod(1 - alpha, -1)
-    before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], -1)
-    return torch.where(after > MIN_TRANSMITTANCE, alpha * before, torch.zeros_like(alpha))

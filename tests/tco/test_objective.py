@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tco.geometry import skew
+from tco.geometry import pixel_grid, rays, skew
 from tco.objective import (
     NothingVisibleError,
     ObjectiveConfig,
@@ -238,6 +238,35 @@ def test_derivatives_of_consistency_match_finite_differences() -> None:
         return consistency(scale * bumpy, Cameras(pose, cameras.K * scale), 0, [1], context)
 
     assert torch.autograd.gradcheck(f, (scale, shift), eps=1e-8, atol=1e-5)
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.3, -0.3])
+def test_the_photometric_term_is_lowest_at_the_true_depth(slope: float) -> None:
+    """A textured plane z = 2 + slope · x, seen from the side: of all scales of the depth, 1 is the best."""
+    h, w = 24, 32
+    K = torch.tensor([[30.0, 0, 16], [0, 30.0, 12], [0, 0, 1]], dtype=F64)
+    g = torch.Generator().manual_seed(0)
+    waves = 3 * torch.randn(3, 8, 2, generator=g, dtype=F64)
+
+    def view(centre: Tensor) -> tuple[Tensor, Tensor]:
+        ray = rays(pixel_grid(h, w, K).reshape(-1, 2), K)
+        depth = (2 + slope * centre[0] - centre[2]) / (ray[:, 2] - slope * ray[:, 0])
+        point = centre + depth.unsqueeze(-1) * ray
+        color = 0.5 + 0.1 * torch.sin(torch.einsum("cki,pi->cpk", waves, point[:, :2])).sum(-1)
+        return depth.reshape(h, w), color.reshape(3, h, w)
+
+    pose = torch.eye(4, dtype=F64).repeat(2, 1, 1)
+    pose[1, :3, 3] = torch.tensor([0.2, 0.05, 0.1])
+    (depth, image), (other_depth, other) = view(pose[0, :3, 3]), view(pose[1, :3, 3])
+    inner = torch.zeros(1, h, w, dtype=torch.bool)
+    inner[:, 3:-3, 3:-6] = True
+    scales = [0.98, 0.985, 0.99, 0.995, 1.0, 1.005, 1.01, 1.015, 1.02]
+    losses = []
+    for scale in scales:
+        surfels = from_depth(scale * depth, K, pose[0], image, torch.full((h, w), 10.0, dtype=F64))
+        cameras = Cameras(pose[1:], K.unsqueeze(0))
+        losses.append(float(photometric(surfels, other[None], cameras, 1.1 * other_depth[None], inner)))
+    assert abs(scales[int(np.argmin(losses))] - 1) < 0.006
 
 
 def _tangent(gradient: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:

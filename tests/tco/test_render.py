@@ -133,10 +133,11 @@ def gradients(
 
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_cpu_engine_agrees_with_the_twin(name: str, dtype: torch.dtype) -> None:
+@pytest.mark.parametrize(("engine", "definition"), [("cpu", "twin"), ("surface", "surface_twin")])
+def test_engines_agree_with_their_twins(name: str, dtype: torch.dtype, engine: str, definition: str) -> None:
     scene = SCENES[name]()
-    ours, our_grads = gradients(scene, cameras(), "cpu", dtype)
-    twin, twin_grads = gradients(scene, cameras(), "twin")
+    ours, our_grads = gradients(scene, cameras(), engine, dtype)
+    twin, twin_grads = gradients(scene, cameras(), definition)
     tolerance = 1e-9 if dtype == torch.float64 else 1e-4
     for a, b in zip(ours, twin, strict=True):
         assert a.dtype == dtype
@@ -161,7 +162,7 @@ def smooth() -> Surfels:
     return replace(s, opacities=0.4 + 0.1 * s.opacities, scales=s.scales + 5.0)
 
 
-@pytest.mark.parametrize("engine", ["twin", "cpu"])
+@pytest.mark.parametrize("engine", ["twin", "cpu", "surface_twin", "surface"])
 def test_derivatives_match_finite_differences(engine: str) -> None:
     """Large surfels cover all pixels (no threshold is crossed); poses move on the group."""
     scene, cams = smooth(), cameras(2)
@@ -222,6 +223,21 @@ def test_low_pass_filter_keeps_a_point_visible() -> None:
     out = render(scene, cameras(1), SIZE)
     assert float(out.alpha[0, 7, 9]) == pytest.approx(float(scene.opacities[0]) * math.exp(-0.5))
     assert float(out.alpha[0, 7, 10]) == pytest.approx(float(scene.opacities[0]) * math.exp(-2.5))
+
+
+def test_surface_is_the_mean_of_what_is_near_and_hides_what_is_behind() -> None:
+    """On the axis: two surfels of a surface with weights 0.5 and 0.25, one behind, a skirt in front."""
+    means = torch.tensor([[0.0, 0, 2], [0, 0, 2.01], [0, 0, 4], [0.3, 0, 1]], dtype=F64)
+    scene = Surfels(
+        means, torch.tensor([[1.0, 0, 0, 0]] * 4, dtype=F64), torch.full((4, 2), 0.1, dtype=F64),
+        torch.tensor([0.5, 0.25, 1.0, 1.0], dtype=F64), torch.eye(4, dtype=F64)[:, :3],
+    )  # fmt: skip
+    K = torch.tensor([[15.0, 0, 9.5], [0, 15.0, 7.5], [0, 0, 1]], dtype=F64).unsqueeze(0)
+    out = render(scene, Cameras(torch.eye(4, dtype=F64).unsqueeze(0), K), SIZE, "surface")
+    alpha = 1 - math.exp(-0.75)
+    assert float(out.alpha[0, 7, 9]) == pytest.approx(alpha)
+    assert out.color[0, 7, 9].tolist() == pytest.approx([alpha * 2 / 3, alpha / 3, 0])
+    assert float(out.depth[0, 7, 9]) == pytest.approx(2 + 0.01 / 3)
 
 
 def test_finished_pixels_stop_and_alpha_is_clamped() -> None:
@@ -294,27 +310,30 @@ def test_a_plane_seen_from_another_view_has_its_depth() -> None:
     torch.testing.assert_close(out.depth[0, 4:-4, 4:-4], torch.full_like(inside, 1.7))
 
 
-def test_rendering_a_view_into_itself_keeps_the_picture_in_place() -> None:
-    """With one convention for pixel centres, the picture comes back unshifted: its centroid stays.
+@pytest.mark.parametrize("slope", [0.0, 0.4, -0.4])
+def test_surface_engine_keeps_the_picture_in_place(slope: float) -> None:
+    """With one convention for pixel centres, a view rendered into itself comes back unshifted.
 
-    The surfels are nearly transparent: opaque ones at equal depth hide each other in the order of the
-    input, which by itself moves a picture by a fraction of a pixel.
+    Compositing moves it on a slant, because the nearer of two overlapping surfels hides the other.
     """
     h, w = 24, 32
     y, x = torch.meshgrid(torch.arange(h, dtype=F64), torch.arange(w, dtype=F64), indexing="ij")
     blob = torch.exp(-((x - 15) ** 2 + (y - 11) ** 2) / 18).expand(3, h, w)
     K = torch.tensor([[30.0, 0, 16], [0, 30.0, 12], [0, 0, 1]], dtype=F64)
     eye, ones = torch.eye(4, dtype=F64), torch.ones(h, w, dtype=F64)
+    depth = 2 / (1 - slope * (x + 0.5 - 16) / 30)
 
-    def shift(config: SurfelConfig) -> tuple[float, float]:
-        s = from_depth(2 * ones, K, eye, blob, 1.02 * ones, config=config)
-        out = render(s, Cameras(eye.unsqueeze(0), K.unsqueeze(0)), (h, w))
+    def shift(engine: str, config: SurfelConfig) -> tuple[float, float]:
+        s = from_depth(depth, K, eye, blob, 20 * ones, config=config)
+        out = render(s, Cameras(eye.unsqueeze(0), K.unsqueeze(0)), (h, w), engine)
         c = out.color[0, ..., 0] / out.alpha[0].clamp_min(1e-3)
         c = c * (c > 0.05)
         return float((c * x).sum() / c.sum()) - 15, float((c * y).sum() / c.sum()) - 11
 
-    assert shift(SurfelConfig()) == pytest.approx((0, 0), abs=0.02)
-    assert shift(SurfelConfig(pixel_centre=0.0)) == pytest.approx((-0.5, -0.5), abs=0.05)
+    assert shift("surface", SurfelConfig()) == pytest.approx((0, 0), abs=0.02)
+    assert shift("surface", SurfelConfig(pixel_centre=0.0)) == pytest.approx((-0.5, -0.5), abs=0.05)
+    if slope:
+        assert shift("cpu", SurfelConfig())[0] * slope > 0.1 * abs(slope)
 
 
 def test_errors_name_the_cause() -> None:
