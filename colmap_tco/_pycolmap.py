@@ -89,7 +89,12 @@ def read_model(path: Path) -> Model:
             cause = f"camera {camera.camera_id} has no valid size or focal length"
             raise InputError(_broken(path, suffix, cause))
     if suffix == ".bin" and (path / "cameras.bin").stat().st_size < _cameras_size(model):
-        raise InputError(_broken(path, suffix, "cameras.bin is shorter than its own header says"))
+        raise InputError(_broken(path, suffix, "cameras.bin ends before its last entry"))
+    in_images = sum(image.num_points3D for image in model.images.values())
+    in_points = sum(point.track.length() for point in model.points3D.values())
+    if in_images != in_points:
+        cause = f"its images have {in_images} observations, its points {in_points}"
+        raise InputError(_broken(path, suffix, cause))
     return model
 
 
@@ -367,7 +372,7 @@ def run_mapper(inputs: tuple[Path, Path], output: Path, use_global: bool, thread
         seed: of the random generators, where the version has a setting.
 
     Returns:
-        The number of models.
+        The number of models that hold points.
     """
     pycolmap = load()
     pycolmap.set_random_seed(seed)
@@ -378,4 +383,4 @@ def run_mapper(inputs: tuple[Path, Path], output: Path, use_global: bool, thread
             setattr(options, name, value)
     run = pycolmap.global_mapping if use_global else pycolmap.incremental_mapping
     models = run(str(inputs[0]), str(inputs[1]), str(output), options=options)
-    return len(models)
+    return sum(len(model.points3D) > 0 for model in models.values())

@@ -159,6 +159,7 @@ def _reconstruct(job: _Job, config: MappingConfig) -> None:
     share = config.cameras == "shared"
     for names in _camera_groups(job) if share else [job.names]:
         _pycolmap.extract_features(job.database, job.folder, names, share, job.threads, job.seed)
+    _require_features(job)
     matcher = _choose_matcher(config.matcher, len(job.names))
     log.info("matching: %s", matcher)
     if matcher == "retrieval":
@@ -172,6 +173,15 @@ def _reconstruct(job: _Job, config: MappingConfig) -> None:
         raise InputError(
             f"{job.folder}: COLMAP found no reconstruction in {len(job.names)} images. They need texture, "
             "much overlap, and a camera that moves sideways; --matcher exhaustive tries all pairs."
+        )
+
+
+def _require_features(job: _Job) -> None:
+    """Before pycolmap 4, matching images without features aborts the process."""
+    features = [len(part) for part in largest_descriptors(job.database, count=2)[1]]
+    if sum(count > 1 for count in features) < 2:
+        raise InputError(
+            f"{job.folder}: COLMAP found no features in these images; they are blank or very small"
         )
 
 

@@ -309,4 +309,5 @@ def crop(view: View, maps: _Map) -> _Map:
     """The part (…, h, w) of maps on the canvas (…, H, W) that is the view's own network image; no copy."""
     width, height = view.network.width, view.network.height
     left, top = (maps.shape[-1] - width) // 2, (maps.shape[-2] - height) // 2
-    return maps[..., top : top + height, left : left + width]  # type: ignore[no-any-return]
+    part: _Map = maps[..., top : top + height, left : left + width]
+    return part

@@ -112,7 +112,7 @@ def test_similar_pictures_of_a_real_database(mapped: Path) -> None:
 def test_retrieval_and_the_global_mapper_beside_the_users_database(pictures: Path, tmp_path: Path) -> None:
     (tmp_path / "images").symlink_to(pictures)
     (tmp_path / "database.db").write_bytes(b"the user's")
-    config = MappingConfig(matcher="retrieval", mapper="global", overlap=1, num_similar=2)
+    config = MappingConfig(matcher="retrieval", mapper="global", overlap=1, num_similar=3)
     ensure_model(tmp_path, config=config, num_threads=1)
     assert len(open_workspace(tmp_path).images) == 4
     assert (tmp_path / "database.db").read_bytes() == b"the user's"
@@ -145,6 +145,11 @@ def test_what_cannot_be_mapped_is_said(tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
     for i in range(2):
         cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), np.full((60, 80, 3), 99, np.uint8))
+    with pytest.raises(InputError, match="no features"):
+        ensure_model(tmp_path, num_threads=1)
+    for i in range(2):
+        noise = np.random.default_rng(i).integers(0, 256, (60, 80, 3), dtype=np.uint8)
+        cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), noise)
     with pytest.raises(InputError, match="no reconstruction in 2 images"):
         ensure_model(tmp_path, num_threads=1)
     assert not (tmp_path / "sparse").exists()

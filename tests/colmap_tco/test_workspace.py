@@ -281,7 +281,7 @@ def test_pinhole_models_keep_ids_names_poses_and_points(name: str, shared: Path)
         assert (a.image_id, a.name) == (b.image_id, b.name)
         assert np.abs(a.cam_from_world - b.cam_from_world).max() < 1e-6
     for a, b in zip(_pycolmap.points(model), _pycolmap.points(new), strict=True):
-        assert np.array_equal(a, b)
+        assert np.allclose(a, b, rtol=1e-9)
     assert new.compute_num_observations() == model.compute_num_observations()
     old = np.mean([point.error for point in model.points3D.values()])
     assert new.compute_mean_reprojection_error() == pytest.approx(old, rel=0.05)
