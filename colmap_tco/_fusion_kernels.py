@@ -69,7 +69,7 @@ class Votes(NamedTuple):
 class Limits(NamedTuple):
     """Bounds of the consistency test; see :class:`colmap_tco.fusion.FusionConfig`.
 
-    ``pixel_x``, ``pixel_y``: pixels of the full image per pixel of the reference's map.
+    ``depth_error`` is relative, ``reproj_error`` in pixels of the reference's map.
     """
 
     depth_error: float
@@ -77,8 +77,6 @@ class Limits(NamedTuple):
     cos_normal: float
     sigma_at_one: float
     most_depth_error: float
-    pixel_x: float
-    pixel_y: float
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -190,16 +188,22 @@ def _tolerance(limits: Limits, one: float, other: float) -> float:
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _reprojects(
-    ref: Maps, limits: Limits, ray: tuple[float, float], moved: tuple[float, float, float]
-) -> bool:
-    """Whether a point of the reference frame falls onto the pixel of ``ray``, in pixels of the full image."""
+def _reprojection(ref: Maps, direction: tuple[float, float], moved: tuple[float, float, float]) -> float:
+    """Squared distance in pixels from the pixel of a ray to the image of a point of the reference frame."""
     if moved[2] <= 0.0:
-        return False
+        return np.inf
     inverse = 1.0 / moved[2]
-    du = ref.intrinsics[0] * (moved[0] * inverse - ray[0]) * limits.pixel_x
-    dv = ref.intrinsics[1] * (moved[1] * inverse - ray[1]) * limits.pixel_y
-    return bool(du * du + dv * dv <= limits.reproj_error * limits.reproj_error)
+    du = ref.intrinsics[0] * (moved[0] * inverse - direction[0])
+    dv = ref.intrinsics[1] * (moved[1] * inverse - direction[1])
+    return float(du * du + dv * dv)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _cosine(ref: Maps, row: int, col: int, n: tuple[float, float, float]) -> float:
+    """Of the angle between the normal of a pixel and another normal in the reference frame."""
+    return float(
+        n[0] * ref.normal[row, col, 0] + n[1] * ref.normal[row, col, 1] + n[2] * ref.normal[row, col, 2]
+    )
 
 
 UNSEEN, HOLE, OCCLUDED, THROUGH, DEPTH, REPROJECTION, NORMAL, AGREES = range(8)
@@ -241,15 +245,13 @@ def _compare(
             return DEPTH, 0.0, none, none
         return THROUGH if error > 0.0 else OCCLUDED, 0.0, none, none
     shift = _turn_back(transform, x * error, y * error, error)
-    if not _reprojects(
-        ref, limits, direction, (point[0] + shift[0], point[1] + shift[1], point[2] + shift[2])
-    ):
+    moved = (point[0] + shift[0], point[1] + shift[1], point[2] + shift[2])
+    if not _reprojection(ref, direction, moved) <= limits.reproj_error * limits.reproj_error:
         return REPROJECTION, 0.0, none, none
     n = _turn_back(transform, other.normal[j, i, 0], other.normal[j, i, 1], other.normal[j, i, 2])
-    cosine = n[0] * ref.normal[row, col, 0] + n[1] * ref.normal[row, col, 1] + n[2] * ref.normal[row, col, 2]
-    if cosine < limits.cos_normal:
+    if _cosine(ref, row, col, n) < limits.cos_normal:
         return NORMAL, 0.0, none, none
-    return AGREES, weight * (1.0 - outlying * outlying) ** 2, shift, n
+    return AGREES, weight, shift, n
 
 
 @njit(cache=True, error_model="numpy")
@@ -297,7 +299,8 @@ def vote(
 ) -> NDArray[np.int64]:
     """Let one neighbour, number ``slot`` of the reference, vote on ``pixels`` (M,), flat indices.
 
-    An agreeing view counts with its confidence times Tukey's biweight of its depth error.
+    An agreeing view counts with its confidence. Weights that fall with the depth error would draw the
+    mean to the reference, whose own error is as large.
 
     Threads take ranges of pixels, not pixels: a parallel loop that writes to arrays reached through
     a tuple loses values (numba 0.68), and a call for each pixel costs more than the comparison.
@@ -319,3 +322,47 @@ def vote(
         )
         _vote_range(ref, pixels[first:last], other, transform, limits, slot, part, outcomes[r])
     return outcomes.sum(0)
+
+
+@njit(cache=True, error_model="numpy")
+def differences(
+    ref: Maps,
+    pixels: NDArray[np.int64],
+    other: Maps,
+    transform: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> int:
+    """Fill ``out`` (M, 3) with how much a neighbour differs at those of ``pixels`` that it sees.
+
+    The columns are the relative depth error, the reprojection error in pixels, and the angle between
+    the normals in radians.
+
+    Returns how many rows were filled.
+    """
+    width, found = ref.depth.shape[1], 0
+    for m in range(len(pixels)):
+        row = pixels[m] // width
+        col = pixels[m] - row * width
+        direction = ray(ref, row, col)
+        z = float(ref.depth[row, col])
+        x, y, depth = move(transform, direction[0] * z, direction[1] * z, z)
+        if depth <= 0.0:
+            continue
+        x, y = x / depth, y / depth
+        u = other.intrinsics[0] * x + other.intrinsics[2]
+        v = other.intrinsics[1] * y + other.intrinsics[3]
+        if not (0.0 <= u < other.depth.shape[1] and 0.0 <= v < other.depth.shape[0]):
+            continue
+        j, i = int(v), int(u)
+        surface = _surface(other, j, i, x, y)
+        if surface <= 0.0:
+            continue
+        error = surface - depth
+        shift = _turn_back(transform, x * error, y * error, error)
+        moved = (direction[0] * z + shift[0], direction[1] * z + shift[1], z + shift[2])
+        n = _turn_back(transform, other.normal[j, i, 0], other.normal[j, i, 1], other.normal[j, i, 2])
+        out[found, 0] = abs(error) / depth
+        out[found, 1] = np.sqrt(_reprojection(ref, direction, moved))
+        out[found, 2] = np.arccos(min(max(_cosine(ref, row, col, n), -1.0), 1.0))
+        found += 1
+    return found

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_tco.errors import DensifyError
-from colmap_tco.fusion_report import FusionReport, why_empty
+from colmap_tco.fusion_report import FusionReport, Tolerance, why_empty
 from colmap_tco.ply import Cloud, Visibility, join
 from tco.config import knob
 
@@ -81,13 +81,20 @@ class FusionConfig:
         "A point is dropped if the views that look through it, to a surface behind, are more than this many "
         "times the views that agree on it. 0 switches it off.",
     )
+    adapt_to_noise: bool = knob(
+        True,
+        "Widen max_depth_error, max_reproj_error and max_normal_error to 1.5 times the median difference "
+        "between the views, for depths less exact than those of PatchMatch. Off: the values as given.",
+    )
     sigma_at_one: float = knob(
         0.0,
         "Relative depth error s of a pixel of confidence 1; that of confidence c is s / c. If given, the "
         "allowed error is max(max_depth_error, √(s²/c₁² + s²/c₂²)), for depths whose confidence is "
         "calibrated. 0: not used.",
     )
-    most_depth_error: float = knob(0.05, "Bound of the allowed relative error where sigma_at_one raises it.")
+    most_depth_error: float = knob(
+        0.05, "Bound of the allowed relative error where adapt_to_noise or sigma_at_one raises it."
+    )
 
 
 @dataclass(frozen=True)
@@ -158,13 +165,16 @@ def fuse_views(views: Sequence[FusionView], config: FusionConfig, report: Fusion
     Raises:
         ValueError: settings or neighbours out of range, or arrays of a view that do not fit together.
     """
+    from colmap_tco import _fusion_noise
     from colmap_tco._fusion_shelf import Shelf, threads
 
     _check(views, config)
     shelf = Shelf(views, config)
     with threads(config.num_threads):
+        tolerance = report.tolerance = _fusion_noise.tolerance(shelf, views, config)
+        log.debug("fusion tolerates %s", tolerance)
         for position, view in enumerate(views):
-            cloud = _fuse_reference(shelf, views, position, config, report)
+            cloud = _fuse_reference(shelf, views, position, config, tolerance, report)
             report.points[view.name] = len(cloud)
             report.pixels["points"] += len(cloud)
             report.loads, report.peak_bytes = shelf.loads, shelf.peak_bytes
@@ -183,7 +193,12 @@ def _check(views: Sequence[FusionView], config: FusionConfig) -> None:
 
 
 def _fuse_reference(
-    shelf: Shelf, views: Sequence[FusionView], position: int, config: FusionConfig, report: FusionReport
+    shelf: Shelf,
+    views: Sequence[FusionView],
+    position: int,
+    config: FusionConfig,
+    tolerance: Tolerance,
+    report: FusionReport,
 ) -> Cloud:
     """The points of one reference view."""
     # A set in ascending order: the result does not depend on the order within the list.
@@ -197,7 +212,7 @@ def _fuse_reference(
     report.pixels["already_fused"] += int(has_depth.sum() - free.sum())
     pixels = np.flatnonzero(free)
     blocks = np.array_split(pixels, max(1, math.ceil(len(pixels) / _BLOCK)))
-    fuser = _Reference(shelf, views, position, neighbours, config, report)
+    fuser = _Reference(shelf, views, position, neighbours, config, tolerance, report)
     return join(fuser.fuse(block) for block in blocks)
 
 
@@ -210,6 +225,7 @@ class _Reference:
     position: int
     neighbours: list[int]
     config: FusionConfig
+    tolerance: Tolerance
     report: FusionReport
 
     def fuse(self, pixels: NDArray[np.int64]) -> Cloud:
@@ -289,7 +305,7 @@ class _Reference:
             other = self.shelf.get(neighbour)
             who, move = _agrees(votes, slot), self._to(neighbour)
             kernels.sample_colors(points, who, move, other.image_intrinsics, other.image, samples, count)
-            error = self.config.max_depth_error
+            error = self.tolerance.depth
             kernels.mark_taken(points, who, footprint, move, other.maps, error, other.taken)
         colors = np.empty((len(points), 3), np.uint8)
         kernels.median_colors(samples, count, colors)
@@ -309,25 +325,25 @@ class _Reference:
         return self.shelf.get(self.position).maps
 
     def _to(self, neighbour: int) -> NDArray[np.float64]:
-        """The (3, 4) transform from the reference camera to a neighbour."""
-        ref, other = self.views[self.position], self.views[neighbour]
-        rotation = other.cam_from_world[:3, :3] @ ref.cam_from_world[:3, :3].T
-        shift = other.cam_from_world[:3, :3] @ (_centre(ref) - _centre(other))
-        return np.ascontiguousarray(np.concatenate([rotation, shift[:, None]], 1))
+        return other_from_reference(self.views[neighbour], self.views[self.position])
 
     def _limits(self) -> Limits:
         from colmap_tco import _fusion_kernels as kernels
 
-        camera, shape = self.views[self.position].camera, self._maps().depth.shape
         return kernels.Limits(
-            depth_error=self.config.max_depth_error,
-            reproj_error=self.config.max_reproj_error,
-            cos_normal=math.cos(math.radians(self.config.max_normal_error)),
+            depth_error=self.tolerance.depth,
+            reproj_error=self.tolerance.reproj,
+            cos_normal=math.cos(math.radians(self.tolerance.normal)),
             sigma_at_one=self.config.sigma_at_one,
             most_depth_error=self.config.most_depth_error,
-            pixel_x=camera.width / shape[1],
-            pixel_y=camera.height / shape[0],
         )
+
+
+def other_from_reference(other: FusionView, reference: FusionView) -> NDArray[np.float64]:
+    """The (3, 4) transform between two cameras, without loss where world coordinates are large."""
+    rotation = other.cam_from_world[:3, :3] @ reference.cam_from_world[:3, :3].T
+    shift = other.cam_from_world[:3, :3] @ (_centre(reference) - _centre(other))
+    return np.ascontiguousarray(np.concatenate([rotation, shift[:, None]], 1))
 
 
 def _agrees(votes: Votes, slot: int) -> NDArray[np.bool_]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 FILTERS = {
     "no_depth": "they have no depth",
@@ -19,6 +19,21 @@ PIXEL_FATES = ("all", *FILTERS, "already_fused", "points")
 COMPARISONS = ("max_depth_error", "max_reproj_error", "max_normal_error")
 
 
+@dataclass(frozen=True)
+class Tolerance:
+    """What counts as agreement.
+
+    Attributes:
+        depth: relative depth error.
+        reproj: pixels of the depth map.
+        normal: degrees.
+    """
+
+    depth: float
+    reproj: float
+    normal: float
+
+
 @dataclass
 class FusionReport:
     """Where every pixel went.
@@ -27,6 +42,7 @@ class FusionReport:
         pixels: all pixels, then those that each filter removed, then those taken into points of
             earlier views, then the points.
         comparisons: how often a pixel and a neighbour did not agree, by the first test that failed.
+        tolerance: in use, where it was widened to the noise of the depths.
         points: points a reference view contributed, by name.
         lowered: points accepted by fewer than ``min_num_pixels`` views because no more could see them.
         loads: how often a view was read.
@@ -36,6 +52,7 @@ class FusionReport:
     pixels: dict[str, int] = field(default_factory=lambda: dict.fromkeys(PIXEL_FATES, 0))
     comparisons: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COMPARISONS, 0))
     points: dict[str, int] = field(default_factory=dict)
+    tolerance: Tolerance | None = None
     lowered: int = 0
     loads: int = 0
     peak_bytes: int = 0
@@ -45,6 +62,7 @@ class FusionReport:
         return {
             "pixels": dict(self.pixels),
             "comparisons_failed": dict(self.comparisons),
+            "tolerance": asdict(self.tolerance) if self.tolerance else None,
             "points_by_view": dict(self.points),
             "points_with_fewer_views": self.lowered,
             "views_read": self.loads,

@@ -80,22 +80,30 @@ def write_image(path: Path, image: NDArray[np.uint8]) -> None:
         file.write(data.tobytes())
 
 
-def undistorted_model(model: Model, views: Sequence[View]) -> Model:
-    """The model of the undistorted images: PINHOLE cameras, the same ids, names and poses, the tracks.
+def undistorted_model(
+    model: Model, views: Sequence[View], originals: Mapping[str, View] | None = None
+) -> Model:
+    """The model of the undistorted images: PINHOLE cameras, the same ids and names, the tracks.
 
     Observations go through the exact map of the views; those that the distortion cannot be inverted
     for, or that lie outside the undistorted image, are left out.
+
+    Args:
+        model: COLMAP's.
+        views: with the cameras and poses to write: COLMAP's, or corrected ones.
+        originals: where cameras are corrected, name → the view by which the image was undistorted.
     """
     images = []
-    entries = {entry.image_id: entry for entry in _pycolmap.registered(model)}
     for view in views:
         camera = view.camera
+        drawn = originals[view.name].camera if originals else camera
         xy, points = _pycolmap.observations(model, view.image_id)
-        xy = camera.pixels(_pycolmap.cam_from_img(view.original, xy))
+        xy = drawn.pixels(_pycolmap.cam_from_img(view.original, xy))
         with np.errstate(invalid="ignore"):
-            inside = ((xy >= 0) & (xy <= (camera.width, camera.height))).all(1)
+            inside = ((xy >= 0) & (xy <= (drawn.width, drawn.height))).all(1)
+        entry = _pycolmap.Registered(view.image_id, view.name, view.original, view.cam_from_world)
         row = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        images.append(_pycolmap.PinholeImage(entries[view.image_id], row, xy[inside], points[inside]))
+        images.append(_pycolmap.PinholeImage(entry, row, xy[inside], points[inside]))
     undistorted = _pycolmap.pinhole_model(images, _pycolmap.points(model))
     for view in views:
         undistorted.images[view.image_id].name = view.name  # COLMAP's text format ends a name at a space

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 from scipy.spatial import cKDTree
 
 from colmap_tco.errors import DensifyError
 from colmap_tco.fusion import FusionConfig, FusionMaps, FusionView, fuse, fuse_views
-from colmap_tco.fusion_report import FILTERS, FusionReport
+from colmap_tco.fusion_report import FILTERS, FusionReport, Tolerance
 from colmap_tco.normals import normals_from_depth
 from colmap_tco.pinhole import Pinhole
 
@@ -22,7 +23,7 @@ DISTANCE = 4.0
 CAMERA = Pinhole(*SIZE, 100.0, 104.0, SIZE[0] / 2 + 0.7, SIZE[1] / 2 - 0.4)
 PIXEL = DISTANCE / CAMERA.fx
 """Size of a pixel at the distance of the scene."""
-CONFIG = FusionConfig(num_threads=1)
+CONFIG = FusionConfig(num_threads=1, adapt_to_noise=False)
 NORMAL = np.array([0.2, 0.1, -1.0]) / np.linalg.norm([0.2, 0.1, -1.0])
 RADIUS = 1.0
 
@@ -197,8 +198,8 @@ def votes_by_hand(
         off = (surface - z) / z / config.max_depth_error
         back = (ray * surface[..., None] - move[:, 3]) @ move[:, :3] @ pose[:, :3].T + pose[:, 3]
         here = rays(shape)
-        du = CAMERA.fx * (back[..., 0] / back[..., 2] - here[..., 0])
-        dv = CAMERA.fy * (back[..., 1] / back[..., 2] - here[..., 1])
+        du = CAMERA.fx * shape[1] / CAMERA.width * (back[..., 0] / back[..., 2] - here[..., 0])
+        dv = CAMERA.fy * shape[0] / CAMERA.height * (back[..., 1] / back[..., 2] - here[..., 1])
         cosine = (n @ move[:, :3] * normals).sum(-1)
         agrees = (np.abs(off) <= 1) & (np.hypot(du, dv) <= config.max_reproj_error)
         support += seen & agrees & (cosine >= np.cos(np.radians(config.max_normal_error)))
@@ -372,20 +373,61 @@ def test_an_empty_result_names_the_test_that_failed(
         fuse(views, CONFIG)
 
 
-def test_reprojection_error_is_in_pixels_of_the_image() -> None:
-    """A depth error of 0.8 % over a baseline b moves the point by 0.008 f b / z pixels of the image."""
-
-    def disturb(i: int, depth: Floats) -> Floats:
-        return depth * (1.004 if i % 2 else 0.996)
-
-    scene = Scene(count=2, disturb=disturb)
+@pytest.mark.parametrize("shape", [(72, 96), (36, 48)])
+def test_reprojection_error_is_in_pixels_of_the_depth_map(shape: tuple[int, int]) -> None:
+    """A depth error of 0.8 % over a baseline b moves the point by 0.008 f b / z pixels."""
+    scene = Scene(count=2, shape=shape, disturb=lambda i, depth: depth * (1.004 if i % 2 else 0.996))
     baseline = np.linalg.norm(scene.eye(0) - scene.eye(1))
-    moved = 0.008 * CAMERA.fx * baseline / DISTANCE
-    for shape in ((72, 96), (36, 48)):
-        views = replace(scene, shape=shape).views()
-        assert len(fuse(views, replace(CONFIG, max_reproj_error=1.5 * moved))[0]) > 0.4 * np.prod(shape)
-        with pytest.raises(DensifyError, match="failed by max_reproj_error"):
-            fuse(views, replace(CONFIG, max_reproj_error=0.6 * moved))
+    moved = 0.008 * CAMERA.fx * baseline / DISTANCE * shape[1] / CAMERA.width
+    assert len(fuse(scene.views(), replace(CONFIG, max_reproj_error=1.5 * moved))[0]) > 0.4 * np.prod(shape)
+    with pytest.raises(DensifyError, match="failed by max_reproj_error"):
+        fuse(scene.views(), replace(CONFIG, max_reproj_error=0.6 * moved))
+
+
+def smooth_noise(i: int, shape: tuple[int, ...], sigma: float) -> Floats:
+    """A field of standard deviation ``sigma`` that varies over some ten pixels."""
+    field = np.random.default_rng(i).standard_normal(shape)
+    for axis in (0, 1):
+        field = uniform_filter1d(uniform_filter1d(field, 9, axis), 9, axis)
+    return field * sigma / field.std()
+
+
+@pytest.mark.parametrize("sigma", [0.003, 0.02])
+def test_tolerances_widen_to_the_noise_of_the_depths(sigma: float) -> None:
+    views = Scene(disturb=lambda i, depth: depth * (1 + smooth_noise(i, depth.shape, sigma))).views()
+    adapted, report = fuse(views, replace(CONFIG, adapt_to_noise=True))
+    strict = FusionReport()
+    points = sum(len(part) for part in fuse_views(views, CONFIG, strict))
+    assert report.tolerance is not None
+    assert strict.tolerance == Tolerance(
+        CONFIG.max_depth_error, CONFIG.max_reproj_error, CONFIG.max_normal_error
+    )
+    expected = max(0.01, 1.5 * 0.674 * np.sqrt(2) * sigma)
+    assert report.tolerance.depth == pytest.approx(expected, rel=0.25)
+    assert len(adapted) >= points
+    assert report.pixels["already_fused"] > strict.pixels["already_fused"] or sigma < 0.01
+    error = height(adapted.points, plane) * PIXEL / DISTANCE
+    assert abs(error.mean()) < 0.25 * sigma
+    assert error.std() < 0.8 * sigma
+
+
+def test_exact_depths_keep_the_given_tolerances() -> None:
+    _, report = fuse(Scene(plane).views(), replace(CONFIG, adapt_to_noise=True))
+    assert report.tolerance == Tolerance(
+        CONFIG.max_depth_error, CONFIG.max_reproj_error, CONFIG.max_normal_error
+    )
+
+
+def test_tolerances_are_bounded_where_nothing_agrees() -> None:
+    views = Scene(
+        disturb=lambda i, depth: depth * np.random.default_rng(i).uniform(0.9, 1.1, depth.shape)
+    ).views()
+    report = FusionReport()
+    list(fuse_views(views, replace(CONFIG, adapt_to_noise=True, max_depth_bend=0.0), report))
+    assert report.tolerance is not None
+    assert report.tolerance.depth <= CONFIG.most_depth_error
+    assert report.tolerance.reproj <= 4 * CONFIG.max_reproj_error
+    assert report.tolerance.normal <= 45
 
 
 def test_points_that_others_look_through_are_dropped() -> None:

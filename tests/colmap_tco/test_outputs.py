@@ -7,7 +7,7 @@ import json
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -209,6 +209,26 @@ def test_the_model_keeps_ids_names_poses_and_tracks(made: Made) -> None:
         assert point.track.length() >= 2
     errors = [point.error for point in after.points3D.values()]
     assert max(errors) < 0.01, "the observations moved with the undistortion"
+
+
+def test_corrected_cameras_are_written_and_the_observations_stay_in_the_picture(made: Made) -> None:
+    moved = np.array([[1.0, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0]])
+    corrected = [
+        replace(
+            v, camera=replace(v.camera, fx=1.1 * v.camera.fx), cam_from_world=v.cam_from_world + moved * 0.01
+        )
+        for v in made.views
+    ]
+    for view in corrected:
+        rotation = np.linalg.svd(view.cam_from_world[:, :3])
+        view.cam_from_world[:, :3] = rotation[0] @ rotation[2]
+    plainly = undistorted_model(made.workspace.model, made.views)
+    model = undistorted_model(made.workspace.model, corrected, {view.name: view for view in made.views})
+    for view, entry in zip(corrected, _pycolmap.registered(model), strict=True):
+        assert np.abs(entry.cam_from_world - view.cam_from_world).max() < 1e-9
+        assert entry.camera.params[0] == view.camera.fx
+        ours, theirs = (_pycolmap.observations(m, view.image_id)[0] for m in (model, plainly))
+        assert np.array_equal(ours, theirs)
 
 
 def test_images_show_what_their_cameras_see(made: Made) -> None:

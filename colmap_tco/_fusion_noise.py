@@ -1,0 +1,67 @@
+"""How much the views differ where they see the same surface, and the tolerances that follow from it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_tco import _fusion_kernels as kernels
+from colmap_tco._fusion_shelf import Shelf
+from colmap_tco.fusion import FusionConfig, FusionView, other_from_reference
+from colmap_tco.fusion_report import Tolerance
+
+_VIEWS = 24
+_NEIGHBOURS = 4
+_PIXELS = 4000
+"""What is sampled: so many reference views, evenly spread, neighbours of each, pixels of each."""
+_FEWEST = 500
+"""Comparisons below which nothing is concluded."""
+_OTHER_SURFACE = 0.1
+"""Relative depth difference above which two pixels are taken to show different surfaces."""
+_FACTOR = 1.5
+"""Tolerance over median difference, 1 σ of a normal distribution. Of what is right two thirds of the pairs
+agree, so that among many views enough do; 2 and 3 let more wrong points in than right ones."""
+_MOST_REPROJ, _MOST_NORMAL = 4.0, 45.0
+"""Bounds: times ``max_reproj_error``, and degrees."""
+
+
+def tolerance(shelf: Shelf, views: Sequence[FusionView], config: FusionConfig) -> Tolerance:
+    """The tolerances of the settings, widened to 1.5 times the median difference between views."""
+    given = Tolerance(config.max_depth_error, config.max_reproj_error, config.max_normal_error)
+    if not config.adapt_to_noise:
+        return given
+    found = _sample(shelf, views, config)
+    found = found[found[:, 0] < _OTHER_SURFACE]
+    if len(found) < _FEWEST:
+        return given
+    depth, reproj, normal = (_FACTOR * float(np.median(column)) for column in found.T)
+    return Tolerance(
+        max(given.depth, min(depth, config.most_depth_error)),
+        max(given.reproj, min(reproj, _MOST_REPROJ * given.reproj)),
+        max(given.normal, min(math.degrees(normal), _MOST_NORMAL)),
+    )
+
+
+def _sample(shelf: Shelf, views: Sequence[FusionView], config: FusionConfig) -> NDArray[np.float64]:
+    """Differences (M, 3) of depth, reprojection and normal between some pixels and their neighbours."""
+    blocks = [np.zeros((0, 3))]
+    for position in _spread(range(len(views)), _VIEWS):
+        ref = shelf.get(position).maps
+        valid = np.flatnonzero(ref.depth)
+        pixels = np.asarray(valid[:: max(1, len(valid) // _PIXELS)], np.int64)
+        for neighbour in _spread(sorted(views[position].neighbours[: config.check_num_images]), _NEIGHBOURS):
+            other = shelf.get(neighbour).maps
+            transform = other_from_reference(views[neighbour], views[position])
+            block = np.empty((len(pixels), 3))
+            blocks.append(block[: kernels.differences(ref, pixels, other, transform, block)])
+    return np.concatenate(blocks)
+
+
+def _spread(items: Sequence[int], count: int) -> list[int]:
+    """At most ``count`` of the items, evenly spaced."""
+    if len(items) <= count:
+        return list(items)
+    return [items[i] for i in np.linspace(0, len(items) - 1, count).round().astype(int)]
