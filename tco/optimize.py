@@ -13,12 +13,11 @@ import torch
 from torch import Tensor
 
 from tco.backbones.base import Backbone
-from tco.consistency import depth_consistency
+from tco.corrections import CameraCorrections
 from tco.lora import LoRAConfig, adapted
-from tco.objective import NothingVisibleError, ObjectiveConfig, Targets, photometric
+from tco.objective import NothingVisibleError, ObjectiveConfig, consistency, photometric
 from tco.options import TCOConfig
-from tco.penalties import CameraCorrection, camera_correction, sparse_depth
-from tco.render import render
+from tco.penalties import sparse_depth
 from tco.surfels import from_depth
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
 
@@ -34,14 +33,14 @@ class Outcome:
     Attributes:
         prediction: of all views.
         cameras: of all views, with their corrections.
-        correction: how far each camera went; None if none could move.
+        corrections: how far each camera went (``CameraCorrections.sizes``); empty if none could move.
         history: the named terms of every step, unweighted, and their weighted sum as ``loss``.
         rolled_back: steps at which the loss or its gradient was not finite.
     """
 
     prediction: Prediction
     cameras: Cameras
-    correction: CameraCorrection | None = None
+    corrections: dict[str, list[float]] = field(default_factory=dict)
     history: list[dict[str, float]] = field(default_factory=list)
     rolled_back: tuple[int, ...] = ()
 
@@ -99,7 +98,7 @@ class _Run:
         self.backbone, self.views, self.priors, self.config = backbone, views, priors, config
         self.encoded, self.context, self.generator = encoded, context, generator
         self.overlap, self.sparse = priors.overlap, priors.sparse
-        self.correction = CameraCorrection.zero(priors.cameras) if config.camera_rate > 0 else None
+        self.corrections = CameraCorrections(priors) if config.camera_rate > 0 else None
         self.objective = ObjectiveConfig(
             occlusion_tolerance=config.occlusion_tolerance, exposure=config.exposure, structure=config.structure
         )
@@ -117,28 +116,17 @@ class _Run:
         """Optimiser over the adapters and the camera corrections; remember the start as the best state."""
         c = self.config
         groups: list[dict[str, Any]] = [{"params": list(parameters), "lr": c.rate}]
-        if self.correction is not None:
-            sigmas = self._sigmas()
-            groups += [
-                {"params": [p], "lr": c.camera_rate * float(sigma.mean())}
-                for p, sigma in zip(self.correction.parameters(), sigmas, strict=True)
-            ]
+        if self.corrections is not None:
+            groups.append({"params": list(self.corrections.parameters()), "lr": c.camera_rate})
         self.optimiser = torch.optim.Adam(groups)
         self.parameters = [p for group in groups for p in group["params"]]
         self.best = [p.detach().clone() for p in self.parameters]
         self.best_loss = math.inf
 
-    def _sigmas(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Uncertainty of rotation, centre and focal length of every view."""
-        p = self.priors
-        if p.rotation_sigma is None or p.centre_sigma is None or p.focal_sigma is None:
-            raise ValueError("cameras may only move if rotation_sigma, centre_sigma and focal_sigma are given")
-        return p.rotation_sigma, p.centre_sigma, p.focal_sigma
-
     def cameras(self) -> Cameras:
         """The cameras as they are believed now."""
         assert self.priors.cameras is not None
-        return self.priors.cameras if self.correction is None else self.correction.apply(self.priors.cameras)
+        return self.priors.cameras if self.corrections is None else self.corrections()
 
     def step(self, number: int) -> dict[str, float]:
         """One step; returns its terms and their weighted sum."""
@@ -204,36 +192,34 @@ class _Run:
         prediction = self.backbone.decode(encoded, [source], self.context)
         cameras, targets = self.cameras(), self._targets(source)
         terms: dict[str, Tensor] = {}
-        if c.photometric_weight > 0 and targets:
-            color = self._photometric(source, targets, prediction, cameras)
-            if color is not None:
-                terms["photometric"] = color
-        if c.consistency_weight > 0 and targets:
-            terms["consistency"] = depth_consistency(
-                prediction.depth[0], source, targets, cameras, self.context, c.consistency_tolerance
-            )
+        if targets:
+            try:
+                terms.update(self._compatibility(source, targets, prediction, cameras))
+            except NothingVisibleError as error:
+                logger.warning("%s: no compatibility in this step: %s", self.views.names[source], error)
         if c.sparse_weight > 0 and len(points):
-            terms["sparse"] = sparse_depth(prediction.depth, [points])
-        if self.correction is not None:
-            terms["cameras"] = camera_correction(self.correction, *self._sigmas())
+            terms["sparse"] = sparse_depth(prediction.depth[0], points)
+        if self.corrections is not None:
+            terms["cameras"] = self.corrections.penalty()
         return terms
 
-    def _photometric(
+    def _compatibility(
         self, source: int, targets: list[int], prediction: Prediction, cameras: Cameras
-    ) -> Tensor | None:
-        """Photometric compatibility of one source; None if no target sees its surfels."""
-        surfels = from_depth(
-            prediction.depth[0], cameras.K[source], cameras.world_from_cam[source], self.views.images[source],
-            prediction.confidence[0], valid=self.views.valid[source],
-        )  # fmt: skip
-        there = Targets(
-            self.views.images[targets], cameras[targets], self.context.depth[targets], self.views.valid[targets]
-        )
-        try:
-            return photometric(render(surfels, there.cameras, there.size), there, self.objective)
-        except NothingVisibleError:
-            logger.warning("%s: none of its surfels is seen by another view in this step", self.views.names[source])
-            return None
+    ) -> dict[str, Tensor]:
+        """Compatibility of one source with its targets, in colour and in depth."""
+        c, depth, terms = self.config, prediction.depth[0], {}
+        if c.photometric_weight > 0:
+            surfels = from_depth(
+                depth, cameras.K[source], cameras.world_from_cam[source], self.views.images[source],
+                prediction.confidence[0], valid=self.views.valid[source],
+            )  # fmt: skip
+            terms["photometric"] = photometric(
+                surfels, self.views.images[targets], cameras[targets], self.context.depth[targets],
+                self.views.valid[targets], self.objective,
+            )  # fmt: skip
+        if c.consistency_weight > 0:
+            terms["consistency"] = consistency(depth, cameras, source, targets, self.context, c.consistency_tolerance)
+        return terms
 
     def outcome(self) -> Outcome:
         """Predict all views with the adapted network."""
@@ -242,7 +228,8 @@ class _Run:
             cameras = self.cameras()
         cameras = Cameras(cameras.world_from_cam.detach(), cameras.K.detach())
         prediction = replace(prediction, depth=prediction.depth.detach(), confidence=prediction.confidence.detach())
-        return Outcome(prediction, cameras, self.correction, self.history, tuple(self.rolled_back))
+        sizes = {} if self.corrections is None else self.corrections.sizes()
+        return Outcome(prediction, cameras, sizes, self.history, tuple(self.rolled_back))
 
 
 FEWEST_POINTS = 4

@@ -34,7 +34,7 @@ class TCOConfig:
         0.02, "a rendered surface further behind the target's own by this share of its depth does not count"
     )
     consistency_tolerance: float = knob(
-        0.1, "relative depth difference beyond which two views are taken to see different surfaces"
+        0.02, "relative depth difference above which two views' disagreement is weighed less and less"
     )
     exposure: bool = knob(True, "match brightness and contrast of each pair of views before comparing colours")
     structure: float = knob(0.0, "share of the structural term (SSIM) in the comparison of colours")

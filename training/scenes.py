@@ -294,3 +294,24 @@ def generate(seed: int, views: int = 6, shape: tuple[int, int] = (144, 192), kin
         images = encode(np.stack([c for c, _ in pairs]), rng)
         cams = np.stack([np.linalg.inv(p) for p in poses]).astype(np.float32)
         return Sample(images, depth, np.stack([K] * views), cams)
+
+
+def walk(seed: int, views: int, shape: tuple[int, int]) -> Sample:
+    """A slow walk through one furnished, mostly textured room, which COLMAP can map; for the demo and tests."""
+    rng = np.random.default_rng(seed)
+    builder = Builder(rng, PLAIN + TEXTURED, PLAIN, 0.1)
+    half = np.array([2.4, 2.0, 1.3])
+    builder.add(ROOM, np.array([0, 0, half[2]]), half)
+    _furnish(builder, np.array([-2.0, 0.2, 0]), np.array([2.0, 1.8, 0]), 7)
+    lights = np.array([[0.5, -1.0, 2.3], [-1.5, 0.5, 2.0]])
+    scene = builder.scene(lights, 0.5, np.zeros(3))
+    h, w = shape
+    K = np.array([[0.85 * w, 0, w / 2], [0, 0.85 * w, h / 2], [0, 0, 1]], np.float32)
+    poses = []
+    for t in np.linspace(-1, 1, views):
+        eye = np.array([0.75 * t, -1.6 + 0.15 * t * t, 1.35 + 0.1 * np.sin(5 * t)])
+        poses.append(look_at(eye, np.array([0.35 * t, 1.4, 0.75])))
+    pairs = [render(scene, bank(), K, p.astype(np.float32), shape) for p in poses]
+    images = encode(np.stack([c for c, _ in pairs]), rng)
+    cams = np.stack([np.linalg.inv(p) for p in poses]).astype(np.float32)
+    return Sample(images, np.stack([d for _, d in pairs]), np.stack([K] * views), cams)
