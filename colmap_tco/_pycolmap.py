@@ -18,6 +18,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_tco import model_files
 from colmap_tco.errors import InputError
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -28,7 +29,6 @@ Model: TypeAlias = Any
 Camera: TypeAlias = Any
 """A ``pycolmap.Camera``."""
 
-MODEL_FILES = ("cameras", "images", "points3D")
 SPHERICAL = ("EQUIRECTANGULAR",)
 _QUIET, _TALKATIVE = 2, 0
 
@@ -72,64 +72,41 @@ def read_model(path: Path) -> Model:
     Raises:
         InputError: a file is missing, truncated, or not COLMAP's format.
     """
-    suffix = ".bin" if (path / "cameras.bin").is_file() else ".txt"
-    missing = [name + suffix for name in MODEL_FILES if not (path / (name + suffix)).is_file()]
+    missing = model_files.missing(path)
     if missing:
-        raise InputError(f"{path}: {', '.join(missing)} missing; a COLMAP model needs all of {MODEL_FILES}")
-    if suffix == ".bin":
-        for name, ends_early in (("images", _images_end_early), ("points3D", _points_end_early)):
-            if ends_early((path / f"{name}.bin").read_bytes()):
-                raise InputError(_broken(path, suffix, f"{name}.bin ends before its last entry"))
+        raise InputError(f"{path}: {', '.join(missing)} missing; a model needs {model_files.NAMES}")
+    cut = model_files.cut_off(path)
+    if cut:
+        raise _broken(path, f"{cut} ends before its last entry")
     try:
         model = load().Reconstruction(str(path))
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as error:
-        raise InputError(_broken(path, suffix, f"COLMAP's reader says: {error}")) from error
-    for camera in model.cameras.values():
-        if not _plausible(camera):
-            cause = f"camera {camera.camera_id} has no valid size or focal length"
-            raise InputError(_broken(path, suffix, cause))
-    if suffix == ".bin" and (path / "cameras.bin").stat().st_size < _cameras_size(model):
-        raise InputError(_broken(path, suffix, "cameras.bin ends before its last entry"))
-    in_images = sum(image.num_points3D for image in model.images.values())
-    in_points = sum(point.track.length() for point in model.points3D.values())
-    if in_images != in_points:
-        cause = f"its images have {in_images} observations, its points {in_points}"
-        raise InputError(_broken(path, suffix, cause))
+        raise _broken(path, f"COLMAP's reader says: {error}") from error
+    fault = _fault(path, model)
+    if fault:
+        raise _broken(path, fault)
     return model
 
 
-def _broken(path: Path, suffix: str, cause: str) -> str:
-    files = [path / (name + suffix) for name in MODEL_FILES]
-    sizes = ", ".join(f"{file.name} {file.stat().st_size} bytes" for file in files)
-    return (
+def _broken(path: Path, cause: str) -> InputError:
+    return InputError(
         f"{path}: not readable as a COLMAP model, probably a truncated or interrupted copy "
-        f"({cause}; {sizes}). Copy or export the model again."
+        f"({cause}; {model_files.sizes(path)}). Copy or export the model again."
     )
 
 
-def _images_end_early(data: bytes) -> bool:
-    """Whether images.bin is shorter than its counts say (``scene/reconstruction_io_binary.cc``).
-
-    COLMAP's reader does not look: on a cut points3D.bin it allocates until the memory is full.
-    """
-    at = 8
-    for _ in range(int.from_bytes(data[:8], "little") if len(data) >= 8 else 1):
-        at = data.find(b"\0", at + 64) + 1  # id, quaternion, translation and camera, then the name
-        if not 0 < at <= len(data) - 8:
-            return True
-        at += 8 + 24 * int.from_bytes(data[at : at + 8], "little")
-    return at > len(data)
-
-
-def _points_end_early(data: bytes) -> bool:
-    """Whether points3D.bin is shorter than its counts say."""
-    at = 8
-    for _ in range(int.from_bytes(data[:8], "little") if len(data) >= 8 else 1):
-        at += 51  # id, position, colour, error and track length, then the track
-        if at > len(data):
-            return True
-        at += 8 * int.from_bytes(data[at - 8 : at], "little")
-    return at > len(data)
+def _fault(path: Path, model: Model) -> str:
+    """What shows that a model was read from incomplete files though the reader did not complain."""
+    for camera in model.cameras.values():
+        if not _plausible(camera):
+            return f"camera {camera.camera_id} has no valid size or focal length"
+    if model_files.kind_of(path) == ".bin" and (path / "cameras.bin").stat().st_size < _cameras_size(model):
+        return "cameras.bin ends before its last entry"
+    in_images = sum(image.num_points3D for image in model.images.values())
+    in_points = sum(point.track.length() for point in model.points3D.values())
+    if in_images != in_points:
+        return f"its images have {in_images} observations, its points {in_points}"
+    return ""
 
 
 def _plausible(camera: Camera) -> bool:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_tco import _pycolmap
+from colmap_tco import _pycolmap, model_files
 from colmap_tco._pycolmap import Model, Registered
 from colmap_tco.errors import InputError
 from tco.config import knob
@@ -237,8 +237,10 @@ def find_models(root: Path) -> list[Path]:
 
 def _looks_like_model(folder: Path) -> bool:
     """At least two of COLMAP's three files, so that a copy with one missing is reported, not overlooked."""
-    names = _pycolmap.MODEL_FILES
-    return any(sum((folder / (name + kind)).is_file() for name in names) >= 2 for kind in (".bin", ".txt"))
+    return any(
+        sum((folder / (name + kind)).is_file() for name in model_files.NAMES) >= 2
+        for kind in model_files.KINDS
+    )
 
 
 def choose_model(root: Path, folders: Sequence[Path]) -> tuple[Path, Model, list[str]]:

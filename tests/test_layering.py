@@ -20,7 +20,18 @@ ONLY_IN = {"pycolmap": {"colmap_tco/_pycolmap.py"}}
 """Module → the only files of the packages that import it."""
 
 LAZY = {"torch", "pycolmap", "open3d", "numba", "cv2", "scipy", "kornia"}
-START_UP = ("workspace", "mapping", "views", "pinhole", "priors", "tracks", "chunks", "_pycolmap", "errors")
+START_UP = (
+    "workspace",
+    "mapping",
+    "views",
+    "pinhole",
+    "priors",
+    "tracks",
+    "chunks",
+    "_pycolmap",
+    "model_files",
+    "errors",
+)
 """Modules of ``colmap_tco`` that the command line imports for their settings: nothing in LAZY at the top."""
 
 
