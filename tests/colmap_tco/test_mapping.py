@@ -55,17 +55,18 @@ def render(eye: np.ndarray, walls: list[tuple[np.ndarray, np.ndarray]]) -> np.nd
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four pictures of a back wall and two boxes before it, from a camera that moves sideways."""
+    """Five pictures of a slanted wall and two boards before it, from a camera that moves sideways."""
     rng = np.random.default_rng(0)
     square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)
+    slanted = square @ [[1, 0, 0.35], [0, 1, 0.2], [0, 0, 1]]
     walls = [
-        (paint(rng), square * 4.5 + [0, 0, 6]),
-        (paint(rng), square * 0.9 + [-0.9, 0.3, 4]),
-        (paint(rng), square * 0.8 + [1.0, -0.4, 3.2]),
+        (paint(rng), slanted * 5 + [0, 0, 7]),
+        (paint(rng), slanted * [0.9, 0.9, -1.2] + [-0.9, 0.3, 4]),
+        (paint(rng), slanted * 0.8 + [1.0, -0.4, 3.2]),
     ]
     folder = tmp_path_factory.mktemp("bare") / "images"
     folder.mkdir()
-    for i, x in enumerate(np.linspace(-0.75, 0.75, 4)):
+    for i, x in enumerate(np.linspace(-1.2, 1.2, 5)):
         cv2.imwrite(str(folder / f"{i}.png"), render(np.array([x, 0.15 * (i % 2), 0.1 * i]), walls))
     return folder
 
@@ -79,14 +80,14 @@ def mapped(pictures: Path) -> Path:
 
 def test_bare_pictures_become_a_workspace(mapped: Path) -> None:
     workspace = open_workspace(mapped)
-    assert len(workspace.images) == 4
+    assert len(workspace.images) == 5
     assert len(workspace.model.points3D) > 100
     assert len(workspace.model.cameras) == 1
     assert (mapped / "database.db").is_file()
     assert {path.name for path in mapped.iterdir()} == {"images", "sparse", "database.db"}
     centres = np.stack([-e.cam_from_world[:, :3].T @ e.cam_from_world[:, 3] for e in workspace.images])
     steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
-    assert steps / steps.mean() == pytest.approx(np.ones(3), abs=0.1)
+    assert steps / steps.mean() == pytest.approx(np.ones(4), abs=0.1)
 
 
 def test_a_model_that_is_there_is_left_alone(mapped: Path) -> None:
@@ -97,13 +98,13 @@ def test_a_model_that_is_there_is_left_alone(mapped: Path) -> None:
 
 def test_similar_pictures_of_a_real_database(mapped: Path) -> None:
     names, descriptors = largest_descriptors(mapped / "database.db", count=100)
-    assert names == ["0.png", "1.png", "2.png", "3.png"]
+    assert names == [f"{i}.png" for i in range(5)]
     assert all(part.shape == (100, 128) for part in descriptors)
     assert all(np.allclose(np.linalg.norm(part, axis=1), 1, atol=1e-3) for part in descriptors)
     counts = similarity(descriptors)
     noise = np.abs(np.random.default_rng(0).normal(size=(100, 128))).astype(np.float32)
     noise /= np.linalg.norm(noise, axis=1, keepdims=True)
-    stranger = similarity([*descriptors, noise])[4, :4].max()
+    stranger = similarity([*descriptors, noise])[5, :5].max()
     assert np.array_equal(counts, counts.T)
     assert counts[0, 1] > 5 * max(stranger, 1)
 
@@ -114,7 +115,7 @@ def test_retrieval_and_the_global_mapper_beside_the_users_database(pictures: Pat
     (tmp_path / "database.db").write_bytes(b"the user's")
     config = MappingConfig(matcher="retrieval", mapper="global", overlap=1, num_similar=3)
     ensure_model(tmp_path, config=config, num_threads=1)
-    assert len(open_workspace(tmp_path).images) == 4
+    assert len(open_workspace(tmp_path).images) == 5
     assert (tmp_path / "database.db").read_bytes() == b"the user's"
     assert not (tmp_path / ".sparse-tco.partial").exists()
 
