@@ -46,7 +46,6 @@ class DensifyConfig:
     refine_cameras: bool = knob(
         False, "write the cameras as corrected by the optimisation instead of COLMAP's own"
     )
-    num_threads: int = knob(-1, "threads of all stages; -1 is one a core")
     network: NetworkConfig = field(default_factory=NetworkConfig)
     tco: TCOConfig = field(default_factory=TCOConfig)
     views: ViewConfig = field(default_factory=ViewConfig)
@@ -54,6 +53,11 @@ class DensifyConfig:
     fusion: FusionConfig = field(default_factory=FusionConfig)
     workspace: WorkspaceConfig = field(default_factory=WorkspaceConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
+
+    @property
+    def num_threads(self) -> int:
+        """Threads of all stages; not positive: one a core."""
+        return self.fusion.num_threads
 
 
 @dataclass(frozen=True)
@@ -164,12 +168,14 @@ def _open_or_map(root: Path, config: DensifyConfig) -> Workspace:
     """The workspace; where it has no model, one is made of its images first."""
     if not config.workspace.model_path:
         ensure_model(root, config.workspace.image_path, config.mapping, config.num_threads, config.seed)
-    return open_workspace(root, config.workspace)
+    return open_workspace(root, config.workspace, config.num_threads)
 
 
 def _fingerprint(workspace: Workspace, views: Sequence[View], config: DensifyConfig) -> str:
     """Changes with everything that decides the result."""
-    kept = dataclasses.replace(config, overwrite=False, num_threads=-1)
+    kept = dataclasses.replace(
+        config, overwrite=False, fusion=dataclasses.replace(config.fusion, num_threads=-1)
+    )
     settings = {"settings": outputs.plain(kept), "versions": _versions()}
     masks = [view.mask_path for view in views if view.mask_path is not None]
     model = [path for path in workspace.model_path.iterdir() if path.suffix in (".bin", ".txt")]
@@ -227,8 +233,7 @@ def _fuse_and_write(
     model = outputs.undistorted_model(workspace.model, used, originals)
     indices = outputs.write_model(result.paths, model)
     outputs.write_lists(result.paths, {view.name: neighbours[view.name] for view in used})
-    fusion = dataclasses.replace(config.fusion, num_threads=config.num_threads)
-    cloud, report = fuse(outputs.fusion_views(result.paths, used, neighbours, indices), fusion)
+    cloud, report = fuse(outputs.fusion_views(result.paths, used, neighbours, indices), config.fusion)
     outputs.write_cloud(result.paths, cloud)
     progress.advance(1)
     return {"points": len(cloud), "fusion": report.as_dict()}

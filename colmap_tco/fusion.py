@@ -17,7 +17,7 @@ import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,17 +25,21 @@ from numpy.typing import NDArray
 from colmap_tco.errors import DensifyError
 from colmap_tco.fusion_report import FusionReport, Tolerance, why_empty
 from colmap_tco.ply import Cloud, Visibility, join
+from colmap_tco.workers import Workers
 from tco.config import knob
 
 if TYPE_CHECKING:
     from colmap_tco._fusion_kernels import Limits, Maps, Votes
-    from colmap_tco._fusion_shelf import Shelf
+    from colmap_tco._fusion_shelf import Shelf, ShelfView
     from colmap_tco.pinhole import Pinhole
 
+T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 _BLOCK = 2_000_000
 """Pixels of a reference that are voted on together; bounds the memory of the votes (some 100 MB)."""
+_RANGE = 65_536
+"""Pixels that a thread takes at a time."""
 _COLOR_SAMPLES = 15
 """Views that a colour is the median of, at most."""
 _FEWEST_VIEWS = 3
@@ -64,7 +68,7 @@ class FusionConfig:
         4.0,
         "Gigabytes of maps and images kept in memory (COLMAP: 32). More saves reading when views are many.",
     )
-    num_threads: int = knob(-1, "Threads for fusion; -1 is one a core.")
+    num_threads: int = knob(-1, "Threads of all stages; -1 is one a core.")
     min_confidence: float = knob(
         1.0, "Pixels of a lower confidence are dropped. Confidence is at least 1, so that 1 keeps all."
     )
@@ -166,11 +170,11 @@ def fuse_views(views: Sequence[FusionView], config: FusionConfig, report: Fusion
         ValueError: settings or neighbours out of range, or arrays of a view that do not fit together.
     """
     from colmap_tco import _fusion_noise
-    from colmap_tco._fusion_shelf import Shelf, threads
+    from colmap_tco._fusion_shelf import Shelf
 
     _check(views, config)
-    shelf = Shelf(views, config)
-    with threads(config.num_threads):
+    with Workers(config.num_threads) as workers:
+        shelf = Shelf(views, config, workers)
         tolerance = report.tolerance = _fusion_noise.tolerance(shelf, views, config)
         log.debug("fusion tolerates %s", tolerance)
         for position, view in enumerate(views):
@@ -260,12 +264,36 @@ class _Reference:
         limits = self._limits()
         for slot, neighbour in enumerate(self.neighbours):
             other = self.shelf.get(neighbour)
-            found = kernels.vote(self._maps(), pixels, other.maps, self._to(neighbour), limits, slot, votes)
+            found = self._vote_of(slot, other.maps, self._to(neighbour), limits, pixels, votes)
             failed = self.report.comparisons
             failed["max_depth_error"] += int(found[[kernels.OCCLUDED, kernels.THROUGH, kernels.DEPTH]].sum())
             failed["max_reproj_error"] += int(found[kernels.REPROJECTION])
             failed["max_normal_error"] += int(found[kernels.NORMAL])
         return votes
+
+    def _vote_of(
+        self,
+        slot: int,
+        other: Maps,
+        transform: NDArray[np.float64],
+        limits: Limits,
+        pixels: NDArray[np.int64],
+        votes: Votes,
+    ) -> NDArray[np.int64]:
+        """Add the votes of the neighbour in this slot; returns how often each outcome came up."""
+        from colmap_tco import _fusion_kernels as kernels
+
+        ref = self._maps()
+
+        def run(part: slice) -> NDArray[np.int64]:
+            outcomes = np.zeros(kernels.AGREES + 1, np.int64)
+            kernels.vote(ref, pixels[part], other, transform, limits, slot, votes.select(part), outcomes)
+            return outcomes
+
+        return np.sum([np.zeros(kernels.AGREES + 1, np.int64), *self._run(len(pixels), run)], 0)
+
+    def _run(self, length: int, function: Callable[[slice], T]) -> list[T]:
+        return self.shelf.workers.run(length, _RANGE, function)
 
     def _accept(self, votes: Votes) -> NDArray[np.bool_]:
         """Which pixels have the support that they need; counts the others."""
@@ -288,7 +316,10 @@ class _Reference:
         from colmap_tco import _merge_kernels as kernels
 
         points, normals = np.empty((len(pixels), 3), np.float32), np.empty((len(pixels), 3), np.float32)
-        kernels.average(self._maps(), pixels, votes, points, normals)
+        ref = self._maps()
+        self._run(
+            len(pixels), lambda p: kernels.average(ref, pixels[p], votes.select(p), points[p], normals[p])
+        )
         return points, normals
 
     def _colors_and_marks(self, points: NDArray[np.float32], votes: Votes) -> NDArray[np.uint8]:
@@ -298,17 +329,29 @@ class _Reference:
         samples = np.empty((len(points), min(_COLOR_SAMPLES, 1 + len(self.neighbours)), 3), np.uint8)
         count = np.zeros(len(points), np.uint8)
         footprint = points[:, 2] / np.float32(self._maps().intrinsics[0])
-        own = self.shelf.get(self.position)
-        everyone = np.ones(len(points), bool)
-        kernels.sample_colors(points, everyone, np.eye(3, 4), own.image_intrinsics, own.image, samples, count)
+        error = self.tolerance.depth
+
+        def sample(view: ShelfView, who: NDArray[np.bool_], move: NDArray[np.float64]) -> None:
+            k, image = view.image_intrinsics, view.image
+            self._run(
+                len(points),
+                lambda p: kernels.sample_colors(points[p], who[p], move, k, image, samples[p], count[p]),
+            )
+
+        def mark(view: ShelfView, who: NDArray[np.bool_], move: NDArray[np.float64]) -> None:
+            maps, taken = view.maps, view.taken
+            self._run(
+                len(points),
+                lambda p: kernels.mark_taken(points[p], who[p], footprint[p], move, maps, error, taken),
+            )
+
+        sample(self.shelf.get(self.position), np.ones(len(points), bool), np.eye(3, 4))
         for slot, neighbour in enumerate(self.neighbours):
-            other = self.shelf.get(neighbour)
-            who, move = _agrees(votes, slot), self._to(neighbour)
-            kernels.sample_colors(points, who, move, other.image_intrinsics, other.image, samples, count)
-            error = self.tolerance.depth
-            kernels.mark_taken(points, who, footprint, move, other.maps, error, other.taken)
+            other, who, move = self.shelf.get(neighbour), _agrees(votes, slot), self._to(neighbour)
+            sample(other, who, move)
+            mark(other, who, move)
         colors = np.empty((len(points), 3), np.uint8)
-        kernels.median_colors(samples, count, colors)
+        self._run(len(points), lambda p: kernels.median_colors(samples[p], count[p], colors[p]))
         return colors
 
     def _visibility(self, votes: Votes) -> Visibility:

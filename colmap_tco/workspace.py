@@ -33,7 +33,6 @@ class WorkspaceConfig:
         "",
         "folder of the sparse model; empty: of sparse/*, sparse/ and the workspace the one with most images",
     )
-    num_threads: int = knob(-1, "threads that read and check images; -1: one a core")
 
 
 @dataclass(frozen=True)
@@ -147,7 +146,9 @@ def partial_paths(root: Path) -> DensePaths:
     return DensePaths(root / ".dense-tco.partial")
 
 
-def open_workspace(root: Path | str, config: WorkspaceConfig = WorkspaceConfig()) -> Workspace:
+def open_workspace(
+    root: Path | str, config: WorkspaceConfig = WorkspaceConfig(), num_threads: int = -1
+) -> Workspace:
     """Find, choose and check everything that a run reads.
 
     Raises:
@@ -159,7 +160,7 @@ def open_workspace(root: Path | str, config: WorkspaceConfig = WorkspaceConfig()
     entries = _pycolmap.registered(model)
     folder = find_images(root, config.image_path, [entry.name for entry in entries])
     reasons.append(f"images from {folder}")
-    skipped = check_images(folder, entries, config.num_threads)
+    skipped = check_images(folder, entries, num_threads)
     images = tuple(entry for entry in entries if entry.name not in skipped)
     if not images:
         raise InputError(

@@ -306,7 +306,7 @@ def test_chunk_poses_keep_their_precision_in_map_coordinates(
 @pytest.mark.parametrize("name", ["kitchen", "office", "livingroom", "fountain", "lund_door"])
 def test_real_workspaces(name: str, shared: Path) -> None:
     """Keypoints of real pictures survive the way there and back, and nearly all the picture is kept."""
-    workspace = open_workspace(shared / "data" / name, WorkspaceConfig(num_threads=1))
+    workspace = open_workspace(shared / "data" / name, num_threads=1)
     views, skipped = make_views(workspace, ViewConfig(), 14)
     assert not skipped
     xy, _ = _pycolmap.observations(workspace.model, views[0].image_id)

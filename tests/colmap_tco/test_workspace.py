@@ -256,7 +256,7 @@ def test_dense_paths_are_colmaps() -> None:
 )
 def test_real_workspaces(name: str, model: str, images: int, shared: Path) -> None:
     root = shared / "data" / name
-    workspace = open_workspace(root, WorkspaceConfig(num_threads=1))
+    workspace = open_workspace(root, num_threads=1)
     assert workspace.model_path == root / model
     assert len(workspace.images) == images
     assert not workspace.skipped

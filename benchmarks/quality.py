@@ -1,0 +1,89 @@
+"""Densify the shared real sets and score them against their sensors, beside what else one could run.
+
+``python -m benchmarks.quality --steps 0 40 --baselines interp patchmatch`` prints a Markdown table.
+Workspaces are copied to ``--work`` first; the shared sets are only read.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+SETS = ("kitchen", "office", "livingroom")
+COLUMNS = ("cover", "med", "d2", "d5", "f5", "acc", "comp", "points")
+
+
+def run(command: list[str]) -> tuple[str, float, float]:
+    """Output, seconds and peak resident gigabytes of a command.
+
+    Raises:
+        SystemExit: it failed; what it wrote is shown.
+    """
+    start = time.monotonic()
+    before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    peak = max(before, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
+    if done.returncode not in (0, 6):
+        sys.exit(f"{' '.join(command)} failed with {done.returncode}:\n{done.stdout}\n{done.stderr}")
+    return done.stdout, time.monotonic() - start, peak / 2**20
+
+
+def scored(workspace: Path, *words: str) -> dict[str, float]:
+    """Figures of the shared scorer."""
+    text, _, _ = run([sys.executable, str(SHARED / "tools" / "score.py"), str(workspace), *words])
+    figures: dict[str, float] = json.loads(text.splitlines()[-1])
+    return figures
+
+
+def row(name: str, what: str, figures: dict[str, float], seconds: float) -> str:
+    """A line of the table."""
+    cells = [f"{figures[c]:.4g}" if figures.get(c) is not None else "" for c in COLUMNS]
+    return f"| {name} | {what} | " + " | ".join(cells) + f" | {seconds:.0f} |"
+
+
+def densified(name: str, steps: int, work: Path, rest: list[str]) -> tuple[dict[str, float], float]:
+    """Scores and seconds of our result on one set."""
+    source, copy = SHARED / "data" / name, work / name
+    if not copy.exists():
+        shutil.copytree(source / "sparse", copy / "sparse")
+        os.symlink(source / "images", copy / "images")
+    command = [sys.executable, "-m", "colmap_tco", "densify", str(copy), "--steps", str(steps), "--overwrite", *rest]
+    _, seconds, _ = run(command)
+    kept = work / f"{name}-{steps}"
+    shutil.rmtree(kept, ignore_errors=True)
+    shutil.copytree(copy / "dense-tco", kept)
+    return scored(source, "--dense", str(kept)), seconds
+
+
+def main() -> None:
+    """Command line; other options are handed to densify."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sets", nargs="+", default=list(SETS))
+    parser.add_argument("--steps", nargs="+", type=int, default=[0, 40])
+    parser.add_argument("--baselines", nargs="*", default=["interp"], help="interp, patchmatch")
+    parser.add_argument("--work", type=Path, default=Path("runs/quality"))
+    args, rest = parser.parse_known_args()
+    args.work.mkdir(parents=True, exist_ok=True)
+    out = sys.stdout
+    out.write("| set | method | " + " | ".join(COLUMNS) + " | seconds |\n" + "|---" * (len(COLUMNS) + 3) + "|\n")
+    for name in args.sets:
+        for baseline in args.baselines:
+            half = ["--half"] if baseline == "patchmatch" else []
+            figures = scored(SHARED / "data" / name, "--baseline", baseline, *half)
+            out.write(row(name, baseline, figures, figures["seconds"]) + "\n")
+        for steps in args.steps:
+            figures, seconds = densified(name, steps, args.work, rest)
+            out.write(row(name, f"colmap-tco, {steps} steps", figures, seconds) + "\n")
+            out.flush()
+
+
+if __name__ == "__main__":
+    main()
