@@ -23,9 +23,13 @@ from tco.render.project import Splats
 class _Blending(Protocol):
     """How the sorted splats (N, 16) of one target, with their boxes, become its image (H, W, 5)."""
 
-    def forward(self, target: int, splats: Array, boxes: Array, size: tuple[int, int]) -> Array: ...
+    def forward(self, target: int, splats: Array, boxes: Array, size: tuple[int, int]) -> Array:
+        """The image (H, W, 5)."""
+        ...
 
-    def backward(self, target: int, splats: Array, boxes: Array, image: Array, upstream: Array) -> Array: ...
+    def backward(self, target: int, splats: Array, boxes: Array, image: Array, upstream: Array) -> Array:
+        """Derivatives by the splats (N, 16) from those by the image (H, W, 5)."""
+        ...
 
 
 class _Layers:

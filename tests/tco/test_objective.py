@@ -149,6 +149,18 @@ def test_gain_does_not_reward_misalignment() -> None:
     torch.testing.assert_close(gain, torch.ones_like(gain), atol=0.05, rtol=0)
 
 
+def test_structure_of_two_flat_images_in_closed_form() -> None:
+    """Without contrast, SSIM is (2 a b + c) / (a² + b² + c) with c = 0.01²; half of its lack of 1 counts."""
+    flat = torch.ones(1, 12, 16, 3, dtype=F64)
+    rendered = Rendered(0.2 * flat, flat[..., 0], flat[..., 0])
+    targets = Targets(0.8 * flat.permute(0, 3, 1, 2), flat[..., 0])
+    similarity = (2 * 0.2 * 0.8 + 1e-4) / (0.2**2 + 0.8**2 + 1e-4)
+    expected = 0.15 * 0.6 + 0.85 * (1 - similarity) / 2
+    assert float(colors(rendered, targets, ObjectiveConfig(structure=0.85))) == pytest.approx(
+        expected, rel=1e-6
+    )
+
+
 def test_structure_ignores_a_small_shift_of_brightness_more_than_l1() -> None:
     rendered, targets = scene()
     image = targets.images.permute(0, 2, 3, 1)

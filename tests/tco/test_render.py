@@ -240,9 +240,49 @@ def test_surface_is_the_mean_of_what_is_near_and_hides_what_is_behind() -> None:
     assert float(out.depth[0, 7, 9]) == pytest.approx(2 + 0.01 / 3)
 
 
-def test_finished_pixels_stop_and_alpha_is_clamped() -> None:
-    out = render(stacked(), cameras(1), SIZE)
-    assert 0.99 <= float(out.alpha.max()) < 1 - 1e-4
+def on_axis(depths: list[float], opacities: list[float], scale: float = 0.5) -> tuple[Surfels, Cameras]:
+    """Frontal surfels on the axis of a camera of focal length 15, which meets the centre of pixel (9, 7)."""
+    n = len(depths)
+    means = torch.tensor([[0.0, 0, z] for z in depths], dtype=F64)
+    frames = torch.tensor([[1.0, 0, 0, 0]] * n, dtype=F64)
+    sizes, gray = torch.full((n, 2), scale, dtype=F64), torch.full((n, 3), 0.5, dtype=F64)
+    K = torch.tensor([[15.0, 0, 9.5], [0, 15.0, 7.5], [0, 0, 1]], dtype=F64).unsqueeze(0)
+    eye = torch.eye(4, dtype=F64).unsqueeze(0)
+    return Surfels(means, frames, sizes, torch.tensor(opacities, dtype=F64), gray), Cameras(eye, K)
+
+
+@pytest.mark.parametrize(
+    ("opacities", "alpha"),
+    [
+        ([1.0], 0.99),
+        ([1.0, 0.985], 1 - 0.01 * 0.015),
+        ([0.95, 0.95, 0.97], 0.9975),  # would leave 0.75e-4: the pixel is finished before
+        ([0.95, 0.95, 0.97, 0.5], 0.9975),  # and takes nothing afterwards
+        ([0.95, 0.95, 0.95], 1 - 1.25e-4),
+        ([0.0039], 0.0),
+        ([0.004], 0.004),
+    ],
+)
+@pytest.mark.parametrize("engine", ["cpu", "twin"])
+def test_thresholds_of_compositing(opacities: list[float], alpha: float, engine: str) -> None:
+    scene, cams = on_axis([1.0 + k for k in range(len(opacities))], opacities)
+    assert float(render(scene, cams, SIZE, engine).alpha[0, 7, 9]) == pytest.approx(alpha, abs=1e-12)
+
+
+@pytest.mark.parametrize("engine", ["cpu", "surface", "twin"])
+def test_nothing_nearer_than_the_near_plane_is_seen(engine: str) -> None:
+    scene, cams = on_axis([0.02], [0.5], scale=0.001)
+    assert float(render(scene, cams, SIZE, engine, near=0.021).alpha.max()) == 0
+    assert float(render(scene, cams, SIZE, engine, near=0.019).alpha.max()) > 0.3
+
+
+@pytest.mark.parametrize("engine", ["surface", "surface_twin"])
+def test_tolerance_of_a_surface_is_that_of_a_slope_of_60_degrees(engine: str) -> None:
+    """At focal length 15 surfels within 0.01 + 4 / 15 of the nearest depth are one surface."""
+    for part, together in ((0.99, True), (1.01, False)):
+        scene, cams = on_axis([1.0, 1 + part * (0.01 + 4 / 15)], [0.5, 0.5])
+        alpha = 1 - math.exp(-1.0 if together else -0.5)
+        assert float(render(scene, cams, SIZE, engine).alpha[0, 7, 9]) == pytest.approx(alpha)
 
 
 def test_moving_world_and_cameras_together_changes_nothing() -> None:
