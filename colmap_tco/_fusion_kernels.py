@@ -1,17 +1,15 @@
 """Compiled loops of :mod:`colmap_tco.fusion`: which pixels take part, and which views agree on them.
 
-Each is parallel over pixels that do not share results.
+They are serial and release the interpreter's lock; :class:`colmap_tco.workers.Workers` runs them on
+ranges of pixels.
 
 Coordinates are those of the reference camera, so that large world coordinates cost no precision.
-Pixel indices from ``prange`` are unsigned; they are used to address arrays and never negated.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 KEEP, NO_DEPTH, MASKED, LOW_CONFIDENCE, NO_NORMAL, GRAZING, EDGE = range(7)
@@ -21,69 +19,69 @@ _MOST_TILT = 1.05
 """Largest ratio of depths within one pixel that is ascribed to a slanted surface."""
 
 
-_RANGE = 4096
-"""Pixels that a thread takes at a time."""
+CHANNELS = 5
+"""A packed view is (H, W, 5): depth, normal x y z, confidence, side by side for they are read together.
+
+A pair is (24,): the six numbers of :func:`camera` of the reference, those of the other view, and the
+(3, 4) transform from the first to the second, row by row.
+"""
+
+Votes = tuple[
+    NDArray[np.uint16],
+    NDArray[np.uint16],
+    NDArray[np.uint16],
+    NDArray[np.float32],
+    NDArray[np.float32],
+    NDArray[np.float32],
+    NDArray[np.uint64],
+]
+"""The arrays of :class:`colmap_tco.fusion_votes.Votes`. Kernels take tuples, not classes of ours: numba's
+cache on disk would name the class, and fail to load once a later version has renamed it."""
+Limits = tuple[float, float, float, float, float]
+"""Relative depth error, reprojection error in pixels of the map, least cosine between normals,
+``sigma_at_one``, ``most_depth_error``; see :class:`colmap_tco.fusion.FusionConfig`."""
 
 
-class Maps(NamedTuple):
-    """One view: depth (H, W) without the pixels that filters dropped, unit normal (H, W, 3) in the
-    camera frame, confidence (H, W) or (0, 0) where there is none, intrinsics (fx, fy, cx, cy, 1/fx, 1/fy):
-    a comparison of two pixels would spend half its time in divisions."""
-
-    depth: NDArray[np.float32]
-    normal: NDArray[np.float32]
-    confidence: NDArray[np.float32]
-    intrinsics: NDArray[np.float64]
+def camera(intrinsics: NDArray[np.float64]) -> NDArray[np.float64]:
+    """fx, fy, cx, cy, 1/fx, 1/fy of (fx, fy, cx, cy): divisions would take half the time of a comparison."""
+    return np.concatenate([intrinsics, 1.0 / intrinsics[:2]])
 
 
-class Votes(NamedTuple):
-    """What the other views say of M pixels of the reference.
+def pair(
+    ref: NDArray[np.float64], other: NDArray[np.float64], other_from_ref: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Two cameras (6,) and the (3, 4) transform between them, as the loops take them.
 
-    ``seen`` (M,) views whose image contains the point; ``support`` (M,) views that agree, the
-    reference included; ``conflicts`` (M,) views that look through the point; ``weight`` (M,),
-    ``shift`` (M, 3), ``normal`` (M, 3) weighted sums over the views that agree; ``who`` (M, words)
-    one bit for each neighbour that agrees.
+    Arrays alone, because an array that is reached through a tuple inside a loop is counted as in use
+    and released there, which takes three times as long as the comparison.
     """
-
-    seen: NDArray[np.uint16]
-    support: NDArray[np.uint16]
-    conflicts: NDArray[np.uint16]
-    weight: NDArray[np.float32]
-    shift: NDArray[np.float32]
-    normal: NDArray[np.float32]
-    who: NDArray[np.uint64]
-
-    def select(self, keep: NDArray[np.bool_] | slice) -> Votes:
-        """The votes on some of the pixels."""
-        return Votes(
-            self.seen[keep],
-            self.support[keep],
-            self.conflicts[keep],
-            self.weight[keep],
-            self.shift[keep],
-            self.normal[keep],
-            self.who[keep],
-        )
-
-
-class Limits(NamedTuple):
-    """Bounds of the consistency test; see :class:`colmap_tco.fusion.FusionConfig`.
-
-    ``depth_error`` is relative, ``reproj_error`` in pixels of the reference's map.
-    """
-
-    depth_error: float
-    reproj_error: float
-    cos_normal: float
-    sigma_at_one: float
-    most_depth_error: float
+    return np.concatenate([ref, other, other_from_ref.ravel()])
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def ray(maps: Maps, row: int, col: int) -> tuple[float, float]:
-    """x and y of the ray (x, y, 1) through the centre of a pixel."""
-    k = maps.intrinsics
-    return (col + 0.5 - k[2]) * k[4], (row + 0.5 - k[3]) * k[5]
+def ray(camera: NDArray[np.float64], row: int, col: int) -> tuple[float, float]:
+    """x and y of the ray (x, y, 1) through the centre of a pixel of the (first) camera."""
+    return (col + 0.5 - camera[2]) * camera[4], (row + 0.5 - camera[3]) * camera[5]
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def move(pair: NDArray[np.float64], x: float, y: float, z: float) -> tuple[float, float, float]:
+    """A point of the first camera in the second."""
+    return (
+        pair[12] * x + pair[13] * y + pair[14] * z + pair[15],
+        pair[16] * x + pair[17] * y + pair[18] * z + pair[19],
+        pair[20] * x + pair[21] * y + pair[22] * z + pair[23],
+    )
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _turn_back(pair: NDArray[np.float64], x: float, y: float, z: float) -> tuple[float, float, float]:
+    """A direction of the second camera in the first."""
+    return (
+        pair[12] * x + pair[16] * y + pair[20] * z,
+        pair[13] * x + pair[17] * y + pair[21] * z,
+        pair[14] * x + pair[18] * y + pair[22] * z,
+    )
 
 
 @njit(cache=True, error_model="numpy")
@@ -96,240 +94,194 @@ def _bend(before: float, centre: float, after: float) -> float:
 
 @njit(cache=True, error_model="numpy")
 def _classify_one(
-    maps: Maps, row: int, col: int, bounds: tuple[float, float, float], bottom_right: tuple[int, int]
+    view: NDArray[np.float32],
+    camera: NDArray[np.float64],
+    row: int,
+    col: int,
+    bounds: tuple[float, float, float],
 ) -> int:
-    """The mark of one pixel; ``bounds`` as in :func:`classify`, ``bottom_right`` the last row and column."""
+    """The mark of one pixel; ``bounds`` as in :func:`classify`."""
     min_confidence, max_bend, min_cos = bounds
-    depth, normal = maps.depth, maps.normal
-    z = depth[row, col]
+    z = view[row, col, 0]
     if not z > 0.0:
         return NO_DEPTH
-    if maps.confidence.shape[0] > 0 and maps.confidence[row, col] < min_confidence:
+    if view[row, col, 4] < min_confidence:
         return LOW_CONFIDENCE
-    nx, ny, nz = normal[row, col, 0], normal[row, col, 1], normal[row, col, 2]
+    nx, ny, nz = view[row, col, 1], view[row, col, 2], view[row, col, 3]
     if nx == 0.0 and ny == 0.0 and nz == 0.0:
         return NO_NORMAL
-    x, y = ray(maps, row, col)
+    x, y = ray(camera, row, col)
     if -(nx * x + ny * y + nz) < min_cos * np.sqrt(x * x + y * y + 1.0):
         return GRAZING
     bend = 0.0
-    if 0 < col < bottom_right[1]:
-        bend = _bend(depth[row, col - 1], z, depth[row, col + 1])
-    if 0 < row < bottom_right[0]:
-        bend = max(bend, _bend(depth[row - 1, col], z, depth[row + 1, col]))
+    if 0 < col < view.shape[1] - 1:
+        bend = _bend(view[row, col - 1, 0], z, view[row, col + 1, 0])
+    if 0 < row < view.shape[0] - 1:
+        bend = max(bend, _bend(view[row - 1, col, 0], z, view[row + 1, col, 0]))
     return EDGE if bend > max_bend else KEEP
 
 
-@njit(cache=True, error_model="numpy", parallel=True)
-def classify(maps: Maps, bounds: tuple[float, float, float], marks: NDArray[np.uint8]) -> None:
-    """Mark each pixel of ``marks`` (H, W) that is not MASKED already with KEEP or why it is dropped.
+@njit(cache=True, error_model="numpy", nogil=True)
+def classify(
+    view: NDArray[np.float32],
+    camera: NDArray[np.float64],
+    bounds: tuple[float, float, float],
+    rows: tuple[int, int],
+    marks: NDArray[np.uint8],
+) -> None:
+    """Mark each pixel in ``rows`` of ``marks`` (H, W) that is not MASKED with KEEP or why it is dropped.
 
     ``bounds``: least confidence, largest relative second difference of the inverse depth, least
     cosine between the normal and the direction to the camera.
     """
-    height, width = marks.shape
-    for line in prange(height):
-        row = np.int64(line)
-        for col in range(width):
+    for row in range(rows[0], rows[1]):
+        for col in range(view.shape[1]):
             if marks[row, col] != MASKED:
-                marks[row, col] = _classify_one(maps, row, col, bounds, (height - 1, width - 1))
+                marks[row, col] = _classify_one(view, camera, row, col, bounds)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def confidence(maps: Maps, row: int, col: int) -> float:
-    """Confidence of a pixel, 1 where there is none."""
-    return float(maps.confidence[row, col]) if maps.confidence.shape[0] > 0 else 1.0
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def move(transform: NDArray[np.float64], x: float, y: float, z: float) -> tuple[float, float, float]:
-    """The (3, 4) ``transform`` of a point."""
-    return (
-        transform[0, 0] * x + transform[0, 1] * y + transform[0, 2] * z + transform[0, 3],
-        transform[1, 0] * x + transform[1, 1] * y + transform[1, 2] * z + transform[1, 3],
-        transform[2, 0] * x + transform[2, 1] * y + transform[2, 2] * z + transform[2, 3],
-    )
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _turn_back(transform: NDArray[np.float64], x: float, y: float, z: float) -> tuple[float, float, float]:
-    """The inverse rotation of the (3, 4) ``transform`` of a direction."""
-    return (
-        transform[0, 0] * x + transform[1, 0] * y + transform[2, 0] * z,
-        transform[0, 1] * x + transform[1, 1] * y + transform[2, 1] * z,
-        transform[0, 2] * x + transform[1, 2] * y + transform[2, 2] * z,
-    )
-
-
-@njit(cache=True, error_model="numpy")
-def _surface(maps: Maps, row: int, col: int, x: float, y: float) -> float:
-    """Depth along the ray (x, y, 1) of the tangent plane of pixel (row, col); 0 where it has no depth.
+def _surface(
+    other: NDArray[np.float32], pair: NDArray[np.float64], row: int, col: int, at: tuple[float, float]
+) -> float:
+    """Depth along the ray (x, y, 1) of the tangent plane of a pixel of the second view; 0 if it has none.
 
     Exact on planes at every sub-pixel position, and one memory access; no value is interpolated
     across a discontinuity. A plane that is nearly parallel to the ray says nothing about depth, so
     beyond a ratio of ``_MOST_TILT`` the depth of the pixel stands as it is.
     """
-    depth = float(maps.depth[row, col])
-    if depth <= 0.0:
-        return 0.0
-    nx, ny, nz = maps.normal[row, col, 0], maps.normal[row, col, 1], maps.normal[row, col, 2]
-    centre_x, centre_y = ray(maps, row, col)
-    ratio = (nx * centre_x + ny * centre_y + nz) / (nx * x + ny * y + nz)
+    depth = float(other[row, col, 0])
+    nx, ny, nz = other[row, col, 1], other[row, col, 2], other[row, col, 3]
+    x = (col + 0.5 - pair[8]) * pair[10]
+    y = (row + 0.5 - pair[9]) * pair[11]
+    ratio = (nx * x + ny * y + nz) / (nx * at[0] + ny * at[1] + nz)
     return depth * ratio if 1.0 / _MOST_TILT < ratio < _MOST_TILT else depth
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _tolerance(limits: Limits, one: float, other: float) -> float:
     """Relative depth error allowed between two pixels of these confidences."""
-    if limits.sigma_at_one <= 0.0:
-        return limits.depth_error
-    sigma = limits.sigma_at_one * np.sqrt(1.0 / (one * one) + 1.0 / (other * other))
-    return min(max(limits.depth_error, sigma), max(limits.depth_error, limits.most_depth_error))
+    depth_error, _, _, sigma_at_one, most_depth_error = limits
+    if sigma_at_one <= 0.0:
+        return depth_error
+    sigma = sigma_at_one * np.sqrt(1.0 / (one * one) + 1.0 / (other * other))
+    return min(max(depth_error, sigma), max(depth_error, most_depth_error))
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _reprojection(ref: Maps, direction: tuple[float, float], moved: tuple[float, float, float]) -> float:
-    """Squared distance in pixels from the pixel of a ray to the image of a point of the reference frame."""
+def _reprojection(
+    pair: NDArray[np.float64], direction: tuple[float, float], moved: tuple[float, float, float]
+) -> float:
+    """Squared distance in pixels from the pixel of a ray to the image of a point of the first camera."""
     if moved[2] <= 0.0:
         return np.inf
     inverse = 1.0 / moved[2]
-    du = ref.intrinsics[0] * (moved[0] * inverse - direction[0])
-    dv = ref.intrinsics[1] * (moved[1] * inverse - direction[1])
+    du = pair[0] * (moved[0] * inverse - direction[0])
+    dv = pair[1] * (moved[1] * inverse - direction[1])
     return float(du * du + dv * dv)
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _cosine(ref: Maps, row: int, col: int, n: tuple[float, float, float]) -> float:
-    """Of the angle between the normal of a pixel and another normal in the reference frame."""
-    return float(
-        n[0] * ref.normal[row, col, 0] + n[1] * ref.normal[row, col, 1] + n[2] * ref.normal[row, col, 2]
-    )
 
 
 UNSEEN, HOLE, OCCLUDED, THROUGH, DEPTH, REPROJECTION, NORMAL, AGREES = range(8)
 """Outcomes of comparing one pixel with one view."""
 
 
-@njit(cache=True, error_model="numpy")
-def _compare(
-    ref: Maps, other: Maps, transform: NDArray[np.float64], limits: Limits, at: tuple[int, int]
-) -> tuple[int, float, tuple[float, float, float], tuple[float, float, float]]:
-    """Compare pixel ``at`` of the reference with another view; ``transform`` is other_from_ref.
+@njit(cache=True, error_model="numpy", inline="always")
+def _meet(
+    ref: NDArray[np.float32], other: NDArray[np.float32], pair: NDArray[np.float64], row: int, col: int
+) -> tuple[int, float, float, float, float, float, int, int]:
+    """Where a pixel of the reference meets the other view.
 
-    Returns the outcome and, where it is AGREES, the weight, the shift of the point to the surface
-    of the other view, and that view's normal, both in the reference frame.
+    Returns UNSEEN, HOLE or AGREES; where it is AGREES, the relative depth error, the squared
+    reprojection error, the shift of the point to the surface of the other view in the reference
+    frame (x, y, z), and the row and column in the other view.
     """
-    none = (0.0, 0.0, 0.0)
-    row, col = at
-    direction = ray(ref, row, col)
-    z = float(ref.depth[row, col])
-    point = (direction[0] * z, direction[1] * z, z)
-    x, y, depth = move(transform, point[0], point[1], point[2])
+    direction = ray(pair, row, col)
+    z = float(ref[row, col, 0])
+    x, y, depth = move(pair, direction[0] * z, direction[1] * z, z)
     if depth <= 0.0:
-        return UNSEEN, 0.0, none, none
+        return UNSEEN, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0
     inverse = 1.0 / depth
     x, y = x * inverse, y * inverse
-    u = other.intrinsics[0] * x + other.intrinsics[2]
-    v = other.intrinsics[1] * y + other.intrinsics[3]
-    if not (0.0 <= u < other.depth.shape[1] and 0.0 <= v < other.depth.shape[0]):
-        return UNSEEN, 0.0, none, none
+    u, v = pair[6] * x + pair[8], pair[7] * y + pair[9]
+    if not (0.0 <= u < other.shape[1] and 0.0 <= v < other.shape[0]):
+        return UNSEEN, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0
     j, i = int(v), int(u)
-    surface = _surface(other, j, i, x, y)
-    if surface <= 0.0:
-        return HOLE, 0.0, none, none
-    error = surface - depth
-    weight = confidence(other, j, i)
-    outlying = error * inverse / _tolerance(limits, confidence(ref, row, col), weight)
-    if not abs(outlying) <= 1.0:
-        if abs(outlying) <= 3.0:
-            return DEPTH, 0.0, none, none
-        return THROUGH if error > 0.0 else OCCLUDED, 0.0, none, none
-    shift = _turn_back(transform, x * error, y * error, error)
-    moved = (point[0] + shift[0], point[1] + shift[1], point[2] + shift[2])
-    if not _reprojection(ref, direction, moved) <= limits.reproj_error * limits.reproj_error:
-        return REPROJECTION, 0.0, none, none
-    n = _turn_back(transform, other.normal[j, i, 0], other.normal[j, i, 1], other.normal[j, i, 2])
-    if _cosine(ref, row, col, n) < limits.cos_normal:
-        return NORMAL, 0.0, none, none
-    return AGREES, weight, shift, n
+    if other[j, i, 0] <= 0.0:
+        return HOLE, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0
+    error = _surface(other, pair, j, i, (x, y)) - depth
+    dx, dy, dz = _turn_back(pair, x * error, y * error, error)
+    back = _reprojection(pair, direction, (direction[0] * z + dx, direction[1] * z + dy, z + dz))
+    return AGREES, error * inverse, back, dx, dy, dz, j, i
 
 
-@njit(cache=True, error_model="numpy")
-def _vote_range(
-    ref: Maps,
+@njit(cache=True, error_model="numpy", inline="always")
+def _judge(limits: Limits, off: float, back: float, cosine: float) -> int:
+    """The outcome for a depth error in tolerances, a squared reprojection error, and a normal's cosine."""
+    if not abs(off) <= 1.0:
+        if abs(off) <= 3.0:
+            return DEPTH
+        return THROUGH if off > 0.0 else OCCLUDED
+    if not back <= limits[1] * limits[1]:
+        return REPROJECTION
+    return AGREES if cosine >= limits[2] else NORMAL
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def vote(
+    ref: NDArray[np.float32],
     pixels: NDArray[np.int64],
-    other: Maps,
-    transform: NDArray[np.float64],
+    other: NDArray[np.float32],
+    pair: NDArray[np.float64],
     limits: Limits,
     slot: int,
     votes: Votes,
     outcomes: NDArray[np.int64],
 ) -> None:
-    """Compare ``pixels`` (M,) with a neighbour, add what it says to ``votes``, count the ``outcomes``."""
+    """Let one neighbour, number ``slot`` of the reference, vote on ``pixels`` (M,), flat indices.
+
+    An agreeing view counts with its confidence. Weights that fall with the depth error would draw the
+    mean to the reference, whose own error is as large. ``outcomes`` (8,) counts each outcome.
+    """
     seen, support, conflicts, weights, shifts, normals, who = votes
-    width = ref.depth.shape[1]
+    width = ref.shape[1]
     word, bit = slot >> 6, np.uint64(1) << np.uint64(slot & 63)
     for m in range(len(pixels)):
         row = pixels[m] // width
-        at = (row, pixels[m] - row * width)
-        outcome, weight, shift, normal = _compare(ref, other, transform, limits, at)
+        col = pixels[m] - row * width
+        outcome, error, back, dx, dy, dz, j, i = _meet(ref, other, pair, row, col)
+        if outcome == UNSEEN:
+            outcomes[UNSEEN] += 1
+            continue
+        seen[m] += 1
+        if outcome == HOLE:
+            outcomes[HOLE] += 1
+            continue
+        nx, ny, nz = _turn_back(pair, other[j, i, 1], other[j, i, 2], other[j, i, 3])
+        cosine = nx * ref[row, col, 1] + ny * ref[row, col, 2] + nz * ref[row, col, 3]
+        weight = float(other[j, i, 4])
+        off = error / _tolerance(limits, float(ref[row, col, 4]), weight)
+        outcome = _judge(limits, off, back, cosine)
         outcomes[outcome] += 1
-        if outcome != UNSEEN:
-            seen[m] += 1
         if outcome == THROUGH:
             conflicts[m] += 1
         if outcome == AGREES:
             support[m] += 1
             who[m, word] |= bit
             weights[m] += weight
-            for axis in range(3):
-                shifts[m, axis] += weight * shift[axis]
-                normals[m, axis] += weight * normal[axis]
+            shifts[m, 0] += weight * dx
+            shifts[m, 1] += weight * dy
+            shifts[m, 2] += weight * dz
+            normals[m, 0] += weight * nx
+            normals[m, 1] += weight * ny
+            normals[m, 2] += weight * nz
 
 
-@njit(cache=True, error_model="numpy", parallel=True)
-def vote(
-    ref: Maps,
-    pixels: NDArray[np.int64],
-    other: Maps,
-    transform: NDArray[np.float64],
-    limits: Limits,
-    slot: int,
-    votes: Votes,
-) -> NDArray[np.int64]:
-    """Let one neighbour, number ``slot`` of the reference, vote on ``pixels`` (M,), flat indices.
-
-    An agreeing view counts with its confidence. Weights that fall with the depth error would draw the
-    mean to the reference, whose own error is as large.
-
-    Threads take ranges of pixels, not pixels: a parallel loop that writes to arrays reached through
-    a tuple loses values (numba 0.68), and a call for each pixel costs more than the comparison.
-
-    Returns how often each outcome came up.
-    """
-    ranges = (len(pixels) + _RANGE - 1) // _RANGE
-    outcomes = np.zeros((ranges, AGREES + 1), np.int64)
-    for r in prange(ranges):
-        first, last = r * _RANGE, min(np.int64((r + 1) * _RANGE), len(pixels))
-        part = Votes(
-            votes.seen[first:last],
-            votes.support[first:last],
-            votes.conflicts[first:last],
-            votes.weight[first:last],
-            votes.shift[first:last],
-            votes.normal[first:last],
-            votes.who[first:last],
-        )
-        _vote_range(ref, pixels[first:last], other, transform, limits, slot, part, outcomes[r])
-    return outcomes.sum(0)
-
-
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def differences(
-    ref: Maps,
+    ref: NDArray[np.float32],
     pixels: NDArray[np.int64],
-    other: Maps,
-    transform: NDArray[np.float64],
+    other: NDArray[np.float32],
+    pair: NDArray[np.float64],
     out: NDArray[np.float64],
 ) -> int:
     """Fill ``out`` (M, 3) with how much a neighbour differs at those of ``pixels`` that it sees.
@@ -339,30 +291,17 @@ def differences(
 
     Returns how many rows were filled.
     """
-    width, found = ref.depth.shape[1], 0
+    width, found = ref.shape[1], 0
     for m in range(len(pixels)):
         row = pixels[m] // width
         col = pixels[m] - row * width
-        direction = ray(ref, row, col)
-        z = float(ref.depth[row, col])
-        x, y, depth = move(transform, direction[0] * z, direction[1] * z, z)
-        if depth <= 0.0:
+        outcome, error, back, _, _, _, j, i = _meet(ref, other, pair, row, col)
+        if outcome != AGREES:
             continue
-        x, y = x / depth, y / depth
-        u = other.intrinsics[0] * x + other.intrinsics[2]
-        v = other.intrinsics[1] * y + other.intrinsics[3]
-        if not (0.0 <= u < other.depth.shape[1] and 0.0 <= v < other.depth.shape[0]):
-            continue
-        j, i = int(v), int(u)
-        surface = _surface(other, j, i, x, y)
-        if surface <= 0.0:
-            continue
-        error = surface - depth
-        shift = _turn_back(transform, x * error, y * error, error)
-        moved = (direction[0] * z + shift[0], direction[1] * z + shift[1], z + shift[2])
-        n = _turn_back(transform, other.normal[j, i, 0], other.normal[j, i, 1], other.normal[j, i, 2])
-        out[found, 0] = abs(error) / depth
-        out[found, 1] = np.sqrt(_reprojection(ref, direction, moved))
-        out[found, 2] = np.arccos(min(max(_cosine(ref, row, col, n), -1.0), 1.0))
+        nx, ny, nz = _turn_back(pair, other[j, i, 1], other[j, i, 2], other[j, i, 3])
+        cosine = nx * ref[row, col, 1] + ny * ref[row, col, 2] + nz * ref[row, col, 3]
+        out[found, 0] = abs(error)
+        out[found, 1] = np.sqrt(back)
+        out[found, 2] = np.arccos(min(max(cosine, -1.0), 1.0))
         found += 1
     return found

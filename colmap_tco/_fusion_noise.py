@@ -49,14 +49,15 @@ def _sample(shelf: Shelf, views: Sequence[FusionView], config: FusionConfig) -> 
     """Differences (M, 3) of depth, reprojection and normal between some pixels and their neighbours."""
     blocks = [np.zeros((0, 3))]
     for position in _spread(range(len(views)), _VIEWS):
-        ref = shelf.get(position).maps
-        valid = np.flatnonzero(ref.depth)
+        ref = shelf.get(position)
+        valid = np.flatnonzero(ref.packed[..., 0])
         pixels = np.asarray(valid[:: max(1, len(valid) // _PIXELS)], np.int64)
         for neighbour in _spread(sorted(views[position].neighbours[: config.check_num_images]), _NEIGHBOURS):
-            other = shelf.get(neighbour).maps
+            other = shelf.get(neighbour)
             transform = other_from_reference(views[neighbour], views[position])
+            pair = kernels.pair(ref.camera, other.camera, transform)
             block = np.empty((len(pixels), 3))
-            blocks.append(block[: kernels.differences(ref, pixels, other, transform, block)])
+            blocks.append(block[: kernels.differences(ref.packed, pixels, other.packed, pair, block)])
     return np.concatenate(blocks)
 
 

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_tco import _fusion_kernels as kernels
 from colmap_tco.fusion import FusionConfig, FusionMaps, FusionView
 from colmap_tco.maps import map_intrinsics
+from colmap_tco.workers import Workers
 
 _MARKS = {
     "no_depth": kernels.NO_DEPTH,
@@ -26,16 +25,8 @@ _MARKS = {
 }
 
 
-@contextmanager
-def threads(wanted: int) -> Iterator[None]:
-    """Run the kernels with this many threads, all that there are if not positive."""
-    before = numba.get_num_threads()
-    most = numba.config.NUMBA_NUM_THREADS
-    numba.set_num_threads(min(wanted, most) if wanted > 0 else most)
-    try:
-        yield
-    finally:
-        numba.set_num_threads(before)
+_ROWS = 128
+"""Rows that a thread filters at a time."""
 
 
 @dataclass(frozen=True)
@@ -43,23 +34,25 @@ class ShelfView:
     """A view as the kernels take it.
 
     Attributes:
-        maps: depth without the pixels that filters dropped, normals, confidence, intrinsics.
+        packed: (H, W, 5) depth, 0 where it is missing or a filter dropped it; normal; confidence.
+        camera: (6,) of the maps, see :func:`colmap_tco._fusion_kernels.camera`.
         image: (H', W', 3) uint8.
-        image_intrinsics: (4,) fx, fy, cx, cy of ``image``.
+        image_camera: (6,) of ``image``.
         taken: (H, W) uint8, 1 where a point has been made of the pixel.
         dropped: how many pixels each filter removed.
     """
 
-    maps: kernels.Maps
+    packed: NDArray[np.float32]
+    camera: NDArray[np.float64]
     image: NDArray[np.uint8]
-    image_intrinsics: NDArray[np.float64]
+    image_camera: NDArray[np.float64]
     taken: NDArray[np.uint8]
     dropped: dict[str, int]
 
     @property
     def nbytes(self) -> int:
         """Memory of the arrays."""
-        return int(sum(a.nbytes for a in self.maps) + self.image.nbytes + self.taken.nbytes)
+        return self.packed.nbytes + self.image.nbytes + self.taken.nbytes
 
 
 class Shelf:
@@ -69,7 +62,8 @@ class Shelf:
     are held all the same.
     """
 
-    def __init__(self, views: Sequence[FusionView], config: FusionConfig) -> None:
+    def __init__(self, views: Sequence[FusionView], config: FusionConfig, workers: Workers) -> None:
+        self.workers = workers
         self.loads = 0
         self.peak_bytes = 0
         self._views = views
@@ -115,28 +109,33 @@ class Shelf:
     def _prepare(self, position: int) -> ShelfView:
         view = self._views[position]
         maps = view.load()
-        _check_maps(view, maps)
+        _check_maps(view, maps, self._config)
         shape = maps.depth.shape
-        intrinsics = map_intrinsics(view.camera, shape)
-        confidence = np.zeros((0, 0), np.float32) if maps.confidence is None else maps.confidence
-        whole = kernels.Maps(
-            np.ascontiguousarray(maps.depth, np.float32),
-            np.ascontiguousarray(maps.normal, np.float32),
-            np.ascontiguousarray(confidence, np.float32),
-            np.concatenate([intrinsics, 1.0 / intrinsics[:2]]),
-        )
+        packed = np.ones((*shape, kernels.CHANNELS), np.float32)
+        packed[..., 0] = maps.depth
+        packed[..., 1:4] = maps.normal
+        if maps.confidence is not None:
+            packed[..., 4] = maps.confidence
+        camera = kernels.camera(map_intrinsics(view.camera, shape))
         marks = np.zeros(shape, np.uint8)
         if maps.mask is not None:
             marks[~maps.mask] = kernels.MASKED
-        kernels.classify(whole, _bounds(self._config), marks)
+        bounds = _bounds(self._config)
+        self.workers.run(
+            shape[0],
+            _ROWS,
+            lambda part: kernels.classify(packed, camera, bounds, (part.start, part.stop), marks),
+        )
+        packed[marks != kernels.KEEP, 0] = 0
         taken = np.zeros(shape, np.uint8)
         if position in self._taken:
             taken = np.unpackbits(self._taken.pop(position), count=marks.size).reshape(shape)
         numbers = np.bincount(marks.ravel(), minlength=kernels.EDGE + 1)
         return ShelfView(
-            whole._replace(depth=np.where(marks == kernels.KEEP, whole.depth, np.float32(0))),
+            packed,
+            camera,
             np.ascontiguousarray(maps.image),
-            map_intrinsics(view.camera, maps.image.shape),
+            kernels.camera(map_intrinsics(view.camera, maps.image.shape)),
             taken,
             {name: int(numbers[mark]) for name, mark in _MARKS.items()},
         )
@@ -147,8 +146,10 @@ def _bounds(config: FusionConfig) -> tuple[float, float, float]:
     return config.min_confidence, bend, math.cos(math.radians(config.max_view_angle))
 
 
-def _check_maps(view: FusionView, maps: FusionMaps) -> None:
+def _check_maps(view: FusionView, maps: FusionMaps, config: FusionConfig) -> None:
     shape = maps.depth.shape
+    if maps.confidence is None and (config.min_confidence > 1 or config.sigma_at_one > 0):
+        raise ValueError(f"{view.name}: min_confidence and sigma_at_one need a confidence, it has none")
     if maps.normal.shape != (*shape, 3):
         raise ValueError(f"{view.name}: normals {maps.normal.shape} do not fit the depths {shape}")
     for name, array in (("confidence", maps.confidence), ("mask", maps.mask)):

@@ -6,35 +6,37 @@ Coordinates are those of the reference camera, as in :mod:`colmap_tco._fusion_ke
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
-from colmap_tco._fusion_kernels import Maps, Votes, confidence, move, ray
+from colmap_tco._fusion_kernels import Votes, move, ray
 
 
-@njit(cache=True, error_model="numpy", parallel=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def average(
-    ref: Maps,
+    ref: NDArray[np.float32],
+    camera: NDArray[np.float64],
     pixels: NDArray[np.int64],
     votes: Votes,
     points: NDArray[np.float32],
     normals: NDArray[np.float32],
 ) -> None:
     """Fill ``points`` and ``normals`` (M, 3) of the reference frame with the weighted means of the votes."""
-    width = ref.depth.shape[1]
-    for m in prange(len(pixels)):
+    _, _, _, weights, shifts, theirs, _ = votes
+    width = ref.shape[1]
+    for m in range(len(pixels)):
         row = pixels[m] // width
         col = pixels[m] - row * width
-        x, y = ray(ref, row, col)
-        own = confidence(ref, row, col)
-        scale = 1.0 / (own + votes.weight[m])
-        z = float(ref.depth[row, col])
-        points[m, 0] = x * z + votes.shift[m, 0] * scale
-        points[m, 1] = y * z + votes.shift[m, 1] * scale
-        points[m, 2] = z + votes.shift[m, 2] * scale
+        x, y = ray(camera, row, col)
+        z = float(ref[row, col, 0])
+        own = float(ref[row, col, 4])
+        scale = 1.0 / (own + weights[m])
+        points[m, 0] = x * z + shifts[m, 0] * scale
+        points[m, 1] = y * z + shifts[m, 1] * scale
+        points[m, 2] = z + shifts[m, 2] * scale
         length = 0.0
         for axis in range(3):
-            normals[m, axis] = own * ref.normal[row, col, axis] + votes.normal[m, axis]
+            normals[m, axis] = own * ref[row, col, 1 + axis] + theirs[m, axis]
             length += normals[m, axis] ** 2
         length = np.sqrt(length)
         for axis in range(3):
@@ -55,29 +57,27 @@ def _bilinear(image: NDArray[np.uint8], u: float, v: float, out: NDArray[np.uint
         out[c] = np.uint8((1.0 - b) * top + b * bottom + 0.5)
 
 
-@njit(cache=True, error_model="numpy", parallel=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def sample_colors(
     points: NDArray[np.float32],
     who: NDArray[np.bool_],
-    transform: NDArray[np.float64],
-    intrinsics: NDArray[np.float64],
+    pair: NDArray[np.float64],
     image: NDArray[np.uint8],
     samples: NDArray[np.uint8],
     count: NDArray[np.uint8],
 ) -> None:
     """Append the colour of each of ``points`` (M, 3) that ``who`` (M,) selects to ``samples`` (M, S, 3).
 
-    ``intrinsics`` are those of ``image``, which may be larger than the maps. ``count`` (M,) says how
-    many samples there are already; beyond S no more are taken.
+    The second camera of ``pair`` is that of ``image``, which may be larger than the maps. ``count``
+    (M,) says how many samples there are already; beyond S no more are taken.
     """
-    for m in prange(len(points)):
+    for m in range(len(points)):
         if not who[m] or count[m] >= samples.shape[1]:
             continue
-        x, y, z = move(transform, points[m, 0], points[m, 1], points[m, 2])
+        x, y, z = move(pair, points[m, 0], points[m, 1], points[m, 2])
         if z <= 0.0:
             continue
-        u = intrinsics[0] * x / z + intrinsics[2]
-        v = intrinsics[1] * y / z + intrinsics[3]
+        u, v = pair[6] * x / z + pair[8], pair[7] * y / z + pair[9]
         _bilinear(image, u, v, samples[m, count[m]])
         count[m] += 1
 
@@ -94,27 +94,27 @@ def _sort(samples: NDArray[np.uint8], m: int, n: int, c: int) -> None:
         samples[m, at, c] = value
 
 
-@njit(cache=True, error_model="numpy", parallel=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def median_colors(samples: NDArray[np.uint8], count: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:
     """Median of the first ``count`` (M,) of ``samples`` (M, S, 3) for each channel, into ``out`` (M, 3).
 
     The samples are left in another order.
     """
-    for m in prange(len(out)):
+    for m in range(len(out)):
         n = np.int64(count[m])
         for c in range(3):
-            _sort(samples, np.int64(m), n, c)
+            _sort(samples, m, n, c)
             low, high = np.int64(samples[m, (n - 1) // 2, c]), np.int64(samples[m, n // 2, c])
             out[m, c] = np.uint8((low + high + 1) // 2)
 
 
-@njit(cache=True, error_model="numpy", parallel=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def mark_taken(
     points: NDArray[np.float32],
     who: NDArray[np.bool_],
     footprint: NDArray[np.float32],
-    transform: NDArray[np.float64],
-    other: Maps,
+    other: NDArray[np.float32],
+    pair: NDArray[np.float64],
     depth_error: float,
     taken: NDArray[np.uint8],
 ) -> None:
@@ -126,18 +126,17 @@ def mark_taken(
     finer than two to one keeps the rest of its pixels, for they add detail. Threads may set the
     same pixel to the same 1.
     """
-    fx, fy, cx, cy = other.intrinsics[:4]
     height, width = taken.shape
-    for m in prange(len(points)):
+    for m in range(len(points)):
         if not who[m]:
             continue
-        x, y, z = move(transform, points[m, 0], points[m, 1], points[m, 2])
-        u, v = fx * x / z + cx, fy * y / z + cy
+        x, y, z = move(pair, points[m, 0], points[m, 1], points[m, 2])
+        u, v = pair[6] * x / z + pair[8], pair[7] * y / z + pair[9]
         if z <= 0.0 or not (0.0 <= u < width and 0.0 <= v < height):
             continue
         taken[int(v), int(u)] = 1
-        reach = 0.75 * min(footprint[m] * fx / z, 2.0)
+        reach = 0.75 * min(footprint[m] * pair[6] / z, 2.0)
         for j in range(max(int(np.ceil(v - reach - 0.5)), 0), min(int(v + reach - 0.5), height - 1) + 1):
             for i in range(max(int(np.ceil(u - reach - 0.5)), 0), min(int(u + reach - 0.5), width - 1) + 1):
-                if abs(other.depth[j, i] - z) <= depth_error * z:
+                if abs(other[j, i, 0] - z) <= depth_error * z:
                     taken[j, i] = 1

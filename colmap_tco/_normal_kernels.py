@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 _SMOOTH = 0.005
@@ -12,7 +12,7 @@ _TOLERANCE = 0.01
 """Residual to the plane, relative to the inverse depth, at which a pixel's weight falls to a quarter."""
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, error_model="numpy", inline="always")
 def _at(q: NDArray[np.float32], row: int, col: int) -> float:
     """Inverse depth, 0 outside the map."""
     if row < 0 or col < 0 or row >= q.shape[0] or col >= q.shape[1]:
@@ -20,7 +20,7 @@ def _at(q: NDArray[np.float32], row: int, col: int) -> float:
     return float(q[row, col])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _side(q0: float, q1: float, q2: float) -> tuple[float, float]:
     """Slope away from the centre over one side, and its weight; a weight of 0 means no pixel there."""
     if q1 <= 0.0:
@@ -31,7 +31,7 @@ def _side(q0: float, q1: float, q2: float) -> tuple[float, float]:
     return 0.5 * (q2 - q0), 1.0 / (bend * bend + (_SMOOTH * q0) ** 2)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _slope(q: NDArray[np.float32], row: int, col: int, down: int, right: int) -> float:
     """Derivative of the inverse depth along one axis, from the side without a discontinuity."""
     q0 = _at(q, row, col)
@@ -45,7 +45,7 @@ def _slope(q: NDArray[np.float32], row: int, col: int, down: int, right: int) ->
     return (weight_after * after - weight_before * before) / total
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _fit(
     q: NDArray[np.float32], row: int, col: int, plane: tuple[float, float, float], radius: int
 ) -> tuple[float, float, float, bool]:
@@ -82,7 +82,7 @@ def _fit(
     return centre + mq - a * mx - b * my, a, b, True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _plane(q: NDArray[np.float32], row: int, col: int, radius: int) -> tuple[float, float, float, bool]:
     """Slopes along x and y and value at the pixel of the local plane, and whether there is one."""
     centre = float(q[row, col])
@@ -97,14 +97,17 @@ def _plane(q: NDArray[np.float32], row: int, col: int, radius: int) -> tuple[flo
     return a, b, centre, True
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def plane_normals(
-    q: NDArray[np.float32], intrinsics: NDArray[np.float64], radius: int, out: NDArray[np.float32]
+    q: NDArray[np.float32],
+    intrinsics: NDArray[np.float64],
+    radius: int,
+    rows: tuple[int, int],
+    out: NDArray[np.float32],
 ) -> None:
-    """Fill ``out`` (H, W, 3) with normals of inverse depths ``q`` (H, W) under (fx, fy, cx, cy)."""
+    """Fill ``rows`` of ``out`` (H, W, 3) with normals of inverse depths (H, W) under (fx, fy, cx, cy)."""
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    for line in prange(q.shape[0]):
-        row = np.int64(line)  # prange counts in unsigned integers, in which -row is not what it seems
+    for row in range(rows[0], rows[1]):
         for col in range(q.shape[1]):
             out[row, col] = 0.0
             a, b, centre, ok = _plane(q, row, col, radius)

@@ -24,12 +24,13 @@ from numpy.typing import NDArray
 
 from colmap_tco.errors import DensifyError
 from colmap_tco.fusion_report import FusionReport, Tolerance, why_empty
+from colmap_tco.fusion_votes import Votes
 from colmap_tco.ply import Cloud, Visibility, join
 from colmap_tco.workers import Workers
 from tco.config import knob
 
 if TYPE_CHECKING:
-    from colmap_tco._fusion_kernels import Limits, Maps, Votes
+    from colmap_tco._fusion_kernels import Limits
     from colmap_tco._fusion_shelf import Shelf, ShelfView
     from colmap_tco.pinhole import Pinhole
 
@@ -210,8 +211,8 @@ def _fuse_reference(
     reference = shelf.get(position)
     for reason, count in reference.dropped.items():
         report.pixels[reason] += count
-    report.pixels["all"] += reference.maps.depth.size
-    has_depth = reference.maps.depth.ravel() > 0
+    report.pixels["all"] += reference.taken.size
+    has_depth = (reference.packed[..., 0] > 0).ravel()
     free = has_depth & (reference.taken.ravel() == 0)
     report.pixels["already_fused"] += int(has_depth.sum() - free.sum())
     pixels = np.flatnonzero(free)
@@ -251,43 +252,25 @@ class _Reference:
     def _vote(self, pixels: NDArray[np.int64]) -> Votes:
         from colmap_tco import _fusion_kernels as kernels
 
-        count, words = len(pixels), max(1, math.ceil(len(self.neighbours) / 64))
-        votes = kernels.Votes(
-            seen=np.zeros(count, np.uint16),
-            support=np.ones(count, np.uint16),
-            conflicts=np.zeros(count, np.uint16),
-            weight=np.zeros(count, np.float32),
-            shift=np.zeros((count, 3), np.float32),
-            normal=np.zeros((count, 3), np.float32),
-            who=np.zeros((count, words), np.uint64),
-        )
-        limits = self._limits()
-        for slot, neighbour in enumerate(self.neighbours):
-            other = self.shelf.get(neighbour)
-            found = self._vote_of(slot, other.maps, self._to(neighbour), limits, pixels, votes)
+        votes = Votes.none(len(pixels), len(self.neighbours))
+        for slot in range(len(self.neighbours)):
+            found = self._vote_of(slot, pixels, votes)
             failed = self.report.comparisons
             failed["max_depth_error"] += int(found[[kernels.OCCLUDED, kernels.THROUGH, kernels.DEPTH]].sum())
             failed["max_reproj_error"] += int(found[kernels.REPROJECTION])
             failed["max_normal_error"] += int(found[kernels.NORMAL])
         return votes
 
-    def _vote_of(
-        self,
-        slot: int,
-        other: Maps,
-        transform: NDArray[np.float64],
-        limits: Limits,
-        pixels: NDArray[np.int64],
-        votes: Votes,
-    ) -> NDArray[np.int64]:
+    def _vote_of(self, slot: int, pixels: NDArray[np.int64], votes: Votes) -> NDArray[np.int64]:
         """Add the votes of the neighbour in this slot; returns how often each outcome came up."""
         from colmap_tco import _fusion_kernels as kernels
 
-        ref = self._maps()
+        limits, other = self._limits(), self.shelf.get(self.neighbours[slot])
+        ref, theirs, pair = self._own().packed, other.packed, self._pair(slot, other.camera)
 
         def run(part: slice) -> NDArray[np.int64]:
             outcomes = np.zeros(kernels.AGREES + 1, np.int64)
-            kernels.vote(ref, pixels[part], other, transform, limits, slot, votes.select(part), outcomes)
+            kernels.vote(ref, pixels[part], theirs, pair, limits, slot, tuple(votes.select(part)), outcomes)
             return outcomes
 
         return np.sum([np.zeros(kernels.AGREES + 1, np.int64), *self._run(len(pixels), run)], 0)
@@ -316,46 +299,50 @@ class _Reference:
         from colmap_tco import _merge_kernels as kernels
 
         points, normals = np.empty((len(pixels), 3), np.float32), np.empty((len(pixels), 3), np.float32)
-        ref = self._maps()
+        ref, camera = self._own().packed, self._own().camera
         self._run(
-            len(pixels), lambda p: kernels.average(ref, pixels[p], votes.select(p), points[p], normals[p])
+            len(pixels),
+            lambda p: kernels.average(ref, camera, pixels[p], tuple(votes.select(p)), points[p], normals[p]),
         )
         return points, normals
 
     def _colors_and_marks(self, points: NDArray[np.float32], votes: Votes) -> NDArray[np.uint8]:
         """Colours (M, 3) of the points, whose pixels in the other views are marked as taken."""
-        from colmap_tco import _merge_kernels as kernels
+        from colmap_tco import _fusion_kernels, _merge_kernels
 
+        own = self._own()
         samples = np.empty((len(points), min(_COLOR_SAMPLES, 1 + len(self.neighbours)), 3), np.uint8)
         count = np.zeros(len(points), np.uint8)
-        footprint = points[:, 2] / np.float32(self._maps().intrinsics[0])
-        error = self.tolerance.depth
+        footprint = points[:, 2] * np.float32(own.camera[4])
 
-        def sample(view: ShelfView, who: NDArray[np.bool_], move: NDArray[np.float64]) -> None:
-            k, image = view.image_intrinsics, view.image
+        def sample(view: ShelfView, who: NDArray[np.bool_], pair: NDArray[np.float64]) -> None:
+            kernel, image = _merge_kernels.sample_colors, view.image
+            self._run(len(points), lambda p: kernel(points[p], who[p], pair, image, samples[p], count[p]))
+
+        def mark(view: ShelfView, who: NDArray[np.bool_], pair: NDArray[np.float64]) -> None:
+            kernel, view_of, taken, error = (
+                _merge_kernels.mark_taken,
+                view.packed,
+                view.taken,
+                self.tolerance.depth,
+            )
             self._run(
-                len(points),
-                lambda p: kernels.sample_colors(points[p], who[p], move, k, image, samples[p], count[p]),
+                len(points), lambda p: kernel(points[p], who[p], footprint[p], view_of, pair, error, taken)
             )
 
-        def mark(view: ShelfView, who: NDArray[np.bool_], move: NDArray[np.float64]) -> None:
-            maps, taken = view.maps, view.taken
-            self._run(
-                len(points),
-                lambda p: kernels.mark_taken(points[p], who[p], footprint[p], move, maps, error, taken),
-            )
-
-        sample(self.shelf.get(self.position), np.ones(len(points), bool), np.eye(3, 4))
+        sample(
+            own, np.ones(len(points), bool), _fusion_kernels.pair(own.camera, own.image_camera, np.eye(3, 4))
+        )
         for slot, neighbour in enumerate(self.neighbours):
-            other, who, move = self.shelf.get(neighbour), _agrees(votes, slot), self._to(neighbour)
-            sample(other, who, move)
-            mark(other, who, move)
+            other, who = self.shelf.get(neighbour), votes.agrees(slot)
+            sample(other, who, self._pair(slot, other.image_camera))
+            mark(other, who, self._pair(slot, other.camera))
         colors = np.empty((len(points), 3), np.uint8)
-        self._run(len(points), lambda p: kernels.median_colors(samples[p], count[p], colors[p]))
+        self._run(len(points), lambda p: _merge_kernels.median_colors(samples[p], count[p], colors[p]))
         return colors
 
     def _visibility(self, votes: Votes) -> Visibility:
-        columns = [_agrees(votes, slot) for slot in range(len(self.neighbours))]
+        columns = [votes.agrees(slot) for slot in range(len(self.neighbours))]
         seen = np.stack([np.ones(len(votes.seen), bool), *columns], 1)
         images = np.array([self.views[p].index for p in (self.position, *self.neighbours)], np.uint32)
         order = np.argsort(images, kind="stable")
@@ -364,21 +351,25 @@ class _Reference:
         np.cumsum(np.bincount(point, minlength=len(seen)), out=start[1:])
         return Visibility(start, images[order][column])
 
-    def _maps(self) -> Maps:
-        return self.shelf.get(self.position).maps
+    def _own(self) -> ShelfView:
+        return self.shelf.get(self.position)
 
-    def _to(self, neighbour: int) -> NDArray[np.float64]:
-        return other_from_reference(self.views[neighbour], self.views[self.position])
-
-    def _limits(self) -> Limits:
+    def _pair(self, slot: int, camera: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The reference and the neighbour in this slot, of which ``camera`` is the map's or the image's."""
         from colmap_tco import _fusion_kernels as kernels
 
-        return kernels.Limits(
-            depth_error=self.tolerance.depth,
-            reproj_error=self.tolerance.reproj,
-            cos_normal=math.cos(math.radians(self.tolerance.normal)),
-            sigma_at_one=self.config.sigma_at_one,
-            most_depth_error=self.config.most_depth_error,
+        other = self.views[self.neighbours[slot]]
+        return kernels.pair(
+            self._own().camera, camera, other_from_reference(other, self.views[self.position])
+        )
+
+    def _limits(self) -> Limits:
+        return (
+            self.tolerance.depth,
+            self.tolerance.reproj,
+            math.cos(math.radians(self.tolerance.normal)),
+            self.config.sigma_at_one,
+            self.config.most_depth_error,
         )
 
 
@@ -387,11 +378,6 @@ def other_from_reference(other: FusionView, reference: FusionView) -> NDArray[np
     rotation = other.cam_from_world[:3, :3] @ reference.cam_from_world[:3, :3].T
     shift = other.cam_from_world[:3, :3] @ (_centre(reference) - _centre(other))
     return np.ascontiguousarray(np.concatenate([rotation, shift[:, None]], 1))
-
-
-def _agrees(votes: Votes, slot: int) -> NDArray[np.bool_]:
-    """(M,) whether the neighbour in this slot agrees."""
-    return ((votes.who[:, slot >> 6] >> np.uint64(slot & 63)) & np.uint64(1)).astype(bool)
 
 
 def _centre(view: FusionView) -> NDArray[np.float64]:

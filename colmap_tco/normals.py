@@ -18,18 +18,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_tco.maps import map_intrinsics
+from colmap_tco.workers import Workers
 
 if TYPE_CHECKING:
     from colmap_tco.pinhole import Pinhole
 
+_ROWS = 64
+"""Rows that a thread takes at a time."""
 
-def normals_from_depth(depth: NDArray[np.floating], camera: Pinhole, radius: int = 2) -> NDArray[np.float32]:
+
+def normals_from_depth(
+    depth: NDArray[np.floating], camera: Pinhole, radius: int = 2, num_threads: int = -1
+) -> NDArray[np.float32]:
     """Normals (H, W, 3) in the camera frame, unit length and facing the camera.
 
     Args:
         depth: (H, W) camera z, 0 where there is none.
         camera: the pinhole of the image; its intrinsics are scaled to the map's size.
         radius: the window of the fit is (2 radius + 1)² pixels.
+        num_threads: threads to use, one a core if not positive.
 
     Returns:
         float32; (0, 0, 0) where there is no depth, and where fewer than three neighbouring pixels
@@ -45,5 +52,13 @@ def normals_from_depth(depth: NDArray[np.floating], camera: Pinhole, radius: int
     inverse = np.zeros_like(depth)
     np.divide(1.0, depth, out=inverse, where=depth > 0)
     normals = np.empty((*depth.shape, 3), np.float32)
-    _normal_kernels.plane_normals(inverse, map_intrinsics(camera, depth.shape), radius, normals)
+    intrinsics = map_intrinsics(camera, depth.shape)
+    with Workers(num_threads) as workers:
+        workers.run(
+            len(depth),
+            _ROWS,
+            lambda part: _normal_kernels.plane_normals(
+                inverse, intrinsics, radius, (part.start, part.stop), normals
+            ),
+        )
     return normals

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from colmap_tco import _pycolmap
 from colmap_tco._pycolmap import Model
-from colmap_tco.atomic import atomic_file, write_text
+from colmap_tco.atomic import UNFINISHED, atomic_file, write_text
 from colmap_tco.errors import DensifyError
 from colmap_tco.fusion import FusionMaps, FusionView
 from colmap_tco.maps import read_map, write_map
@@ -118,7 +118,7 @@ def write_model(paths: DensePaths, model: Model) -> dict[str, int]:
         that of the model in memory. It is how ``fused.ply.vis`` names images.
     """
     paths.sparse.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".unfinished", dir=paths.root) as folder:
+    with tempfile.TemporaryDirectory(prefix=f".sparse{UNFINISHED}", dir=paths.root) as folder:
         model.write(folder)
         for file in sorted(Path(folder).iterdir()):
             os.replace(file, paths.sparse / file.name)

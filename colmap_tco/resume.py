@@ -141,8 +141,11 @@ def _resume(partial: DensePaths, fingerprint: str) -> dict[str, dict[str, object
         log.info("%s was begun from other inputs or with other settings: beginning anew", partial.root)
         shutil.rmtree(partial.root)
         return {}
-    for unfinished in partial.root.rglob(f".*{UNFINISHED}*"):
-        unfinished.unlink()
+    for unfinished in list(partial.root.rglob(f"*{UNFINISHED}*")):
+        if unfinished.is_dir():
+            shutil.rmtree(unfinished)
+        else:
+            unfinished.unlink()
     views = {name: figures for name, figures in _views(partial).items() if _all_there(partial, name)}
     log.info("%s: going on after %d finished views", partial.root, len(views))
     return views

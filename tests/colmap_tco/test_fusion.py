@@ -351,7 +351,7 @@ def removed(name: str, maps: FusionMaps) -> FusionMaps:
 def test_an_empty_result_names_the_filter(name: str) -> None:
     views = [with_maps(view, lambda maps: removed(name, maps)) for view in Scene().views()]
     with pytest.raises(DensifyError, match=FILTERS[name].split("(")[0]) as error:
-        fuse(views, replace(CONFIG, min_confidence=2.0))
+        fuse(views, replace(CONFIG, min_confidence=2.0 if name == "min_confidence" else 1.0))
     assert str(7 * SIZE[0] * SIZE[1]) in str(error.value)
 
 
@@ -511,6 +511,12 @@ def test_refuses_maps_that_do_not_fit(change: Callable[[FusionMaps], FusionMaps]
     views[1] = with_maps(views[1], change)
     with pytest.raises(ValueError, match=r"1\.jpg"):
         fuse(views, CONFIG)
+
+
+@pytest.mark.parametrize("name", ["min_confidence", "sigma_at_one"])
+def test_confidence_that_is_asked_for_must_be_there(name: str) -> None:
+    with pytest.raises(ValueError, match=r"0\.jpg: .* need a confidence"):
+        fuse(Scene().views(), replace(CONFIG, **{name: 1.5}))
 
 
 @pytest.mark.parametrize("name", ["min_num_pixels", "max_depth_error", "cache_size"])

@@ -345,6 +345,8 @@ def test_a_killed_run_is_continued(workspace: Path) -> None:
     first = json.loads(partial.manifest.read_text())["views"]
     assert len(first) == 2
     (partial.stereo / ".x.1.unfinished.bin").write_bytes(b"half a file")
+    (partial.root / ".sparse.unfinished-1").mkdir()
+    (partial.root / ".sparse.unfinished-1" / "images.bin").write_bytes(b"half a model")
     result = densify(workspace)
     assert {name: result.views[name] for name in first} == first, "finished views were made again"
     assert len(result.views) == COUNT
