@@ -55,7 +55,17 @@ def densified(name: str, steps: int, work: Path, rest: list[str]) -> tuple[dict[
     if not copy.exists():
         shutil.copytree(source / "sparse", copy / "sparse")
         os.symlink(source / "images", copy / "images")
-    command = [sys.executable, "-m", "colmap_tco", "densify", str(copy), "--steps", str(steps), "--overwrite", *rest]
+    command = [
+        sys.executable,
+        "-m",
+        "colmap_tco",
+        "densify",
+        str(copy),
+        "--steps",
+        str(steps),
+        "--overwrite",
+        *rest,
+    ]
     _, seconds, _ = run(command)
     kept = work / f"{name}-{steps}"
     shutil.rmtree(kept, ignore_errors=True)
@@ -73,7 +83,9 @@ def main() -> None:
     args, rest = parser.parse_known_args()
     args.work.mkdir(parents=True, exist_ok=True)
     out = sys.stdout
-    out.write("| set | method | " + " | ".join(COLUMNS) + " | seconds |\n" + "|---" * (len(COLUMNS) + 3) + "|\n")
+    out.write(
+        "| set | method | " + " | ".join(COLUMNS) + " | seconds |\n" + "|---" * (len(COLUMNS) + 3) + "|\n"
+    )
     for name in args.sets:
         for baseline in args.baselines:
             half = ["--half"] if baseline == "patchmatch" else []

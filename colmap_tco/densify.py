@@ -1,6 +1,6 @@
 """The product: COLMAP workspace in, dense workspace out.
 
-    workspace → views, priors → chunks → tco.optimize(backbone) → Prediction → fusion → outputs
+workspace → views, priors → chunks → tco.optimize(backbone) → Prediction → fusion → outputs
 """
 
 from __future__ import annotations
@@ -129,7 +129,9 @@ def densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified:
     folder = result.publish().root
     done = Densified(folder, json.loads((folder / "report.json").read_text("utf-8")), fresh=True)
     if skipped:
-        raise PartlyDoneError(f"{done.summary()}\n{len(skipped)} images were left out; report.json says why of each")
+        raise PartlyDoneError(
+            f"{done.summary()}\n{len(skipped)} images were left out; report.json says why of each"
+        )
     return done
 
 
@@ -200,7 +202,11 @@ def _predict(
             r = done.views[view.name]
             outputs.write_view(result.paths, view, r.maps)
             camera = r.corrected.camera
-            figures = {**r.figures, "cam_from_world": r.corrected.cam_from_world, "focal": [camera.fx, camera.fy]}
+            figures = {
+                **r.figures,
+                "cam_from_world": r.corrected.cam_from_world,
+                "focal": [camera.fx, camera.fy],
+            }
             result.mark_done(view.name, outputs.plain(figures))  # type: ignore[arg-type]
             progress.advance(1)
     return history
@@ -216,7 +222,9 @@ def _used(result: Result, views: Sequence[View], refine: bool) -> list[View]:
         figures: Any = result.views[view.name]
         fx, fy = figures["focal"]
         camera = dataclasses.replace(view.camera, fx=fx, fy=fy)
-        moved.append(dataclasses.replace(view, camera=camera, cam_from_world=np.array(figures["cam_from_world"])))
+        moved.append(
+            dataclasses.replace(view, camera=camera, cam_from_world=np.array(figures["cam_from_world"]))
+        )
     return moved
 
 

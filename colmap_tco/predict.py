@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from tco.backbones.sweep import Sweep
     from tco.optimize import Outcome
-    from tco.types import Cameras, Prediction, SparseDepth
+    from tco.types import Cameras, Prediction
 
 log = logging.getLogger(__name__)
 
@@ -36,8 +36,12 @@ class NetworkConfig:
     """The network, and where it runs."""
 
     weights: str = knob("", "file of weights (safetensors) to use instead of those in the package")
-    device: str = knob("auto", "auto: cuda if there is one, else cpu; or any name that torch knows, such as cuda:1")
-    chunk_size: int = knob(0, "views that are optimised together; 0: as many as fit half of the free memory, at most 40")
+    device: str = knob(
+        "auto", "auto: cuda if there is one, else cpu; or any name that torch knows, such as cuda:1"
+    )
+    chunk_size: int = knob(
+        0, "views that are optimised together; 0: as many as fit half of the free memory, at most 40"
+    )
 
 
 @dataclass(frozen=True)
@@ -148,7 +152,12 @@ def predict_chunk(
     check = check_projection(tracks, members, frame, cameras)
     priors = build_priors(tracks, members, frame, prior_config, seed)
     outcome = optimize(
-        backbone, images.to(device), priors.optimise.to(device), tco_config, seed, lambda _, terms: report(terms)
+        backbone,
+        images.to(device),
+        priors.optimise.to(device),
+        tco_config,
+        seed,
+        lambda _, terms: report(terms),
     )
     prediction = outcome.prediction.to("cpu")
     assert priors.optimise.sparse is not None
@@ -163,7 +172,9 @@ def predict_chunk(
             "points_held_out": len(held[i]),
             "error_at_points": _median(used[i]),
             "error_at_held_out": _median(held[i]),
-            "held_out_within_5_percent": float((held[i].abs() < 0.05).float().mean()) if len(held[i]) else None,
+            "held_out_within_5_percent": float((held[i].abs() < 0.05).float().mean())
+            if len(held[i])
+            else None,
             "reprojection_error_pixels": check.per_view.get(view.name),
             "correction": _correction(outcome, i, frame.scale),
         }
@@ -200,5 +211,3 @@ def corrected_view(view: View, frame: ChunkFrame, cameras: Cameras, i: int) -> V
     factor = float(cameras.K[i, 0, 0]) / view.network.fx
     camera = replace(view.camera, fx=view.camera.fx * factor, fy=view.camera.fy * factor)
     return replace(view, camera=camera, cam_from_world=np.column_stack([R, t]))
-
-

@@ -74,10 +74,13 @@ def main() -> int:
         return code
     figures = accuracy(sample, names, dense)
     cv2.imwrite(str(args.folder / "cloud.png"), cloud_picture(dense)[..., ::-1])
+    percent = {name: f"{100 * value:.2f} %" for name, value in figures.items()}
     sys.stdout.write(
-        f"cloud   {dense / 'fused.ply'}\nreport  {dense / 'report.json'}\npicture {args.folder / 'cloud.png'}\n"
-        f"accuracy against the rendered truth: {100 * figures['within_5_percent']:.1f} % of all pixels within 5 %, "
-        f"{100 * figures['within_2_percent']:.1f} % within 2 %, median error {100 * figures['median_error']:.2f} %\n"
+        f"cloud   {dense / 'fused.ply'}\n"
+        f"report  {dense / 'report.json'}\n"
+        f"picture {args.folder / 'cloud.png'}\n"
+        f"against the rendered truth: {percent['within_5_percent']} of all pixels within 5 %, "
+        f"{percent['within_2_percent']} within 2 %, median error {percent['median_error']}\n"
     )
     return code
 

@@ -16,7 +16,12 @@ Floats = NDArray[np.float64]
 
 
 def draw(
-    points: Floats, colors: NDArray[np.uint8], cam_from_world: Floats, focal: float, size: tuple[int, int], dot: int = 2
+    points: Floats,
+    colors: NDArray[np.uint8],
+    cam_from_world: Floats,
+    focal: float,
+    size: tuple[int, int],
+    dot: int = 2,
 ) -> NDArray[np.uint8]:
     """Points as squares of ``dot`` pixels, near over far, on white; RGB (H, W, 3)."""
     h, w = size
@@ -50,13 +55,15 @@ def viewpoints(model_path: Path, points: Floats) -> list[tuple[Floats, float, fl
     width, height = _pycolmap.camera_size(entries[middle].camera)
     focal = _pycolmap.focal_lengths(entries[middle].camera)[0] / width
     base = poses[middle]
-    depth = float(np.median((points @ base[2, :3] + base[2, 3])))
+    depth = float(np.median(points @ base[2, :3] + base[2, 3]))
     views = []
     for yaw, pitch, back in ((0.0, 0.0, 0.0), (0.45, 0.25, 0.35), (-0.45, 0.25, 0.35)):
         turn = cv2.Rodrigues(np.array([pitch, yaw, 0.0]))[0]
         # Turn around the point in the middle of the picture at the median depth, then step back.
         shift = np.array([0, 0, depth]) - turn @ np.array([0, 0, depth]) + np.array([0, 0, back * depth])
-        views.append((np.column_stack([turn @ base[:, :3], turn @ base[:, 3] + shift]), focal, height / width))
+        views.append(
+            (np.column_stack([turn @ base[:, :3], turn @ base[:, 3] + shift]), focal, height / width)
+        )
     return views
 
 

@@ -14,4 +14,4 @@ def knob(default: T, help: str, choices: tuple[str, ...] | None = None) -> T:
     The command line is generated from these; ``help`` says what the setting does, in which unit,
     and when to change it.
     """
-    return field(default=default, metadata={"help": help, "choices": choices})  # type: ignore[no-any-return]
+    return field(default=default, metadata={"help": help, "choices": choices})

@@ -27,7 +27,8 @@ class CameraCorrections(nn.Module):
         p = priors
         if p.cameras is None or p.rotation_sigma is None or p.centre_sigma is None or p.focal_sigma is None:
             raise ValueError(
-                "cameras may only move if they and the uncertainty of rotation, centre and focal length are given"
+                "cameras may only move if they and the uncertainty of rotation, centre and focal length "
+                "are given"
             )
         self.cameras = p.cameras
         self.sigmas = (p.rotation_sigma, p.centre_sigma, p.focal_sigma)

@@ -1,4 +1,4 @@
-"""Test-time constrained optimisation: adapt a frozen multi-view network to one chunk of views and its priors."""
+"""Test-time constrained optimisation: adapt a frozen multi-view network to views and their priors."""
 
 from __future__ import annotations
 
@@ -100,7 +100,9 @@ class _Run:
         self.overlap, self.sparse = priors.overlap, priors.sparse
         self.corrections = CameraCorrections(priors) if config.camera_rate > 0 else None
         self.objective = ObjectiveConfig(
-            occlusion_tolerance=config.occlusion_tolerance, exposure=config.exposure, structure=config.structure
+            occlusion_tolerance=config.occlusion_tolerance,
+            exposure=config.exposure,
+            structure=config.structure,
         )
         self.order: list[int] = []
         self.history: list[dict[str, float]] = []
@@ -146,7 +148,10 @@ class _Run:
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.parameters, c.clip)
-        figures = {**{name: float(value.detach()) for name, value in terms.items()}, "loss": float(loss.detach())}
+        figures = {
+            **{name: float(value.detach()) for name, value in terms.items()},
+            "loss": float(loss.detach()),
+        }
         self._update(number, figures["loss"], bool(torch.isfinite(norm)))
         self.history.append(figures)
         return figures
@@ -154,7 +159,9 @@ class _Run:
     def _update(self, number: int, loss: float, finite_gradient: bool) -> None:
         """Take the optimiser's step, or go back to the best state if loss or gradient is not finite."""
         if not (math.isfinite(loss) and finite_gradient):
-            logger.warning("step %d: the loss or its gradient is not finite; back to the best state so far", number)
+            logger.warning(
+                "step %d: the loss or its gradient is not finite; back to the best state so far", number
+            )
             self.rolled_back.append(number)
             with torch.no_grad():
                 for p, kept in zip(self.parameters, self.best, strict=True):
@@ -218,7 +225,9 @@ class _Run:
                 self.views.valid[targets], self.objective,
             )  # fmt: skip
         if c.consistency_weight > 0:
-            terms["consistency"] = consistency(depth, cameras, source, targets, self.context, c.consistency_tolerance)
+            terms["consistency"] = consistency(
+                depth, cameras, source, targets, self.context, c.consistency_tolerance
+            )
         return terms
 
     def outcome(self) -> Outcome:
@@ -227,7 +236,9 @@ class _Run:
             prediction = self.backbone.decode(self.encoded, context=self.context)
             cameras = self.cameras()
         cameras = Cameras(cameras.world_from_cam.detach(), cameras.K.detach())
-        prediction = replace(prediction, depth=prediction.depth.detach(), confidence=prediction.confidence.detach())
+        prediction = replace(
+            prediction, depth=prediction.depth.detach(), confidence=prediction.confidence.detach()
+        )
         sizes = {} if self.corrections is None else self.corrections.sizes()
         return Outcome(prediction, cameras, sizes, self.history, tuple(self.rolled_back))
 

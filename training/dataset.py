@@ -50,7 +50,7 @@ def read(path: Path) -> Sample:
 
 def resized(s: Sample, shape: tuple[int, int]) -> Sample:
     """The sample at another size; depth of the nearest pixel centre."""
-    v, h, w = s.depth.shape
+    h, w = s.depth.shape[1:]
     if (h, w) == shape:
         return s
     images = np.stack([cv2.resize(i, shape[::-1], interpolation=cv2.INTER_AREA) for i in s.images])
@@ -83,7 +83,9 @@ def photographed(images: NDArray[np.uint8], rng: np.random.Generator) -> Floats:
     v, h, w = images.shape[:3]
     x = images.astype(np.float32) / 255
     drift = rng.choice([0.0, 0.04, 0.15])
-    gain = rng.uniform(0.45, 1.15) * np.exp(rng.normal(0, drift, (v, 1, 1, 1)) + rng.normal(0, 0.08 + 0.3 * drift, (v, 1, 1, 3)))
+    gain = rng.uniform(0.45, 1.15) * np.exp(
+        rng.normal(0, drift, (v, 1, 1, 1)) + rng.normal(0, 0.08 + 0.3 * drift, (v, 1, 1, 3))
+    )
     grey = x.mean(-1, keepdims=True)
     x = grey + rng.uniform(0.15, 1.05) * (x - grey)
     yy, xx = np.meshgrid(np.linspace(-1, 1, h), np.linspace(-1, 1, w), indexing="ij")
@@ -114,7 +116,7 @@ class Tracks:
 
 
 def triangulated(s: Sample, rng: np.random.Generator) -> Tracks:
-    """Points as COLMAP would triangulate them: at corners, seen by at least three views, noisy, some wrong."""
+    """Points as COLMAP would triangulate them: at corners, in three views or more, noisy, some wrong."""
     v, h, w = s.depth.shape
     xyz, pose = [], np.linalg.inv(s.cam_from_world.astype(np.float64))
     want = int(np.exp(rng.uniform(np.log(60), np.log(1200))))
@@ -180,7 +182,10 @@ def assemble(s: Sample, images: Floats, tracks: Tracks) -> tuple[Views, Priors, 
     f = torch.float32
     points = tuple(
         SparseDepth(
-            torch.as_tensor(xy, dtype=f), torch.as_tensor(z / unit, dtype=f), torch.as_tensor(e, dtype=f), torch.as_tensor(t)
+            torch.as_tensor(xy, dtype=f),
+            torch.as_tensor(z / unit, dtype=f),
+            torch.as_tensor(e, dtype=f),
+            torch.as_tensor(t),
         )
         for xy, z, e, t in sparse
     )

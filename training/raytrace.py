@@ -6,7 +6,7 @@ primitives takes some tens of milliseconds on one core.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -18,8 +18,7 @@ BOX, ELLIPSOID, CYLINDER, ROOM = 0, 1, 2, 3
 Floats = NDArray[np.float32]
 
 
-@dataclass
-class Scene:
+class Scene(NamedTuple):
     """P primitives, their materials and the light.
 
     Attributes:
@@ -34,6 +33,7 @@ class Scene:
         lights: (L, 3) positions; the first casts shadows.
         ambient: share of the light that comes from everywhere.
         sky: (3,) colour where nothing is hit.
+        mips: :func:`mipmaps` of the textures.
     """
 
     kind: NDArray[np.int32]
@@ -47,6 +47,7 @@ class Scene:
     lights: Floats
     ambient: float
     sky: Floats
+    mips: NDArray[np.uint8]
 
 
 def mipmaps(atlas: Floats) -> NDArray[np.uint8]:
@@ -119,11 +120,12 @@ def _local(rotation, centre, half, origin, direction, o, d):  # type: ignore[no-
 
 
 @njit(cache=True, fastmath=True)
-def _nearest(kind, rotation, centre, half, origin, direction, limit, o, d):  # type: ignore[no-untyped-def]
+def _nearest(scene, origin, direction, limit, o, d):  # type: ignore[no-untyped-def]
     """Distance, primitive and face of the first hit before ``limit``; primitive −1 for none.
 
     A primitive whose bounding sphere the ray misses is skipped.
     """
+    kind, rotation, centre, half = scene.kind, scene.rotation, scene.centre, scene.half
     best, hit, face = limit, -1, 0
     norm = direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2
     for p in range(kind.shape[0]):
@@ -188,92 +190,106 @@ def _texture(texels, u, v, level, rgb):  # type: ignore[no-untyped-def]
         rgb[c] = (top * (1 - fy) + bottom * fy) / 255.0
 
 
+@njit(cache=True, fastmath=True)
+def _lighting(scene, p, point, normal, view, work):  # type: ignore[no-untyped-def]
+    """Diffuse light and highlight at a surface point, seen along the unit vector ``view``."""
+    to_light, o, d = work[0], work[1], work[2]
+    light, shine = scene.ambient, 0.0
+    for k in range(scene.lights.shape[0]):
+        dist = lambert = 0.0
+        for i in range(3):
+            to_light[i] = scene.lights[k, i] - point[i]
+            dist += to_light[i] ** 2
+        dist = np.sqrt(dist) + 1e-6
+        for i in range(3):
+            lambert += to_light[i] / dist * normal[i]
+        if lambert <= 0:
+            continue
+        if k == 0:
+            _, blocker, _ = _nearest(scene, point, to_light, 1.0, o, d)
+            if blocker >= 0 and scene.kind[blocker] != ROOM:
+                continue
+        light += (1 - scene.ambient) * lambert / scene.lights.shape[0] * 1.6
+        if scene.gloss[p] > 0:
+            along = norm = 0.0
+            for i in range(3):
+                h = to_light[i] / dist - view[i]
+                along += h * normal[i]
+                norm += h * h
+            shine += scene.gloss[p] * max(0.0, along / np.sqrt(norm + 1e-9)) ** 40
+    return light, shine
+
+
+@njit(cache=True, fastmath=True)
+def _add_color(scene, origin, ray, hit, pixel_angle, work, out):  # type: ignore[no-untyped-def]
+    """Add the colour of a hit (distance, primitive, face) to ``out``."""
+    t, p, face = hit
+    o, d, q, normal, uv, rgb, point, view = (
+        work[0],
+        work[1],
+        work[3],
+        work[4],
+        work[5],
+        work[6],
+        work[7],
+        work[8],
+    )
+    rotation, world = scene.rotation[p], work[9]
+    _local(rotation, scene.centre[p], scene.half[p], origin, ray, o, d)
+    length = np.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
+    for i in range(3):
+        q[i] = o[i] + t * d[i]
+        view[i] = ray[i] / length
+    _surface(scene.kind[p], scene.half[p], face, q, normal, uv)
+    facing = 0.0
+    for i in range(3):
+        world[i] = rotation[0, i] * normal[0] + rotation[1, i] * normal[1] + rotation[2, i] * normal[2]
+        facing -= world[i] * view[i]
+    for i in range(3):
+        point[i] = origin[i] + t * ray[i] + 1e-3 * world[i]
+    texel, size = scene.texel[p], np.sqrt(scene.mips.shape[1] * 0.75)
+    level = np.log2(max(1e-6, t * pixel_angle * texel * size / max(0.15, facing)))
+    _texture(scene.mips[scene.texture[p, face]], uv[0] * texel, uv[1] * texel, level, rgb)
+    light, shine = _lighting(scene, p, point, world, view, work)
+    for c in range(3):
+        out[c] += rgb[c] * scene.tint[p, c] * light + shine
+
+
 @njit(cache=True, fastmath=True, parallel=True)
-def _trace(  # type: ignore[no-untyped-def]
-    kind, rotation, centre, half, texture, texel, tint, gloss, mips, lights, ambient, sky, inv_k, pose, shape, samples
-):
+def _trace(scene, inv_k, pose, shape, samples):  # type: ignore[no-untyped-def]
     """Colour (H, W, 3) from samples² rays a pixel and depth (H, W) of the centre ray; 0 is sky."""
     height, width = shape
     color = np.zeros((height, width, 3), np.float32)
     depth = np.zeros((height, width), np.float32)
     pixel_angle = inv_k[0, 0] / samples
-    size = np.sqrt(mips.shape[1] * 0.75)
     for row in prange(height):
-        o, d, q = np.empty(3), np.empty(3), np.empty(3)
-        normal, uv, rgb = np.empty(3), np.empty(2), np.empty(3)
-        origin, ray, point, world_n, to_light = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-        for i in range(3):
-            origin[i] = pose[i, 3]
+        work, ray, origin = np.empty((10, 3)), np.empty(3), pose[:3, 3].copy()
         for col in range(width):
             for s in range(samples * samples + 1):
-                centre_ray = s == samples * samples
-                dx = 0.5 if centre_ray else (s % samples + 0.5) / samples
-                dy = 0.5 if centre_ray else (s // samples + 0.5) / samples
+                middle = s == samples * samples
+                dx = 0.5 if middle else (s % samples + 0.5) / samples
+                dy = 0.5 if middle else (s // samples + 0.5) / samples
                 x, y = inv_k[0, 0] * (col + dx) + inv_k[0, 2], inv_k[1, 1] * (row + dy) + inv_k[1, 2]
                 for i in range(3):
                     ray[i] = pose[i, 0] * x + pose[i, 1] * y + pose[i, 2]
-                t, p, face = _nearest(kind, rotation, centre, half, origin, ray, 1e4, o, d)
-                if centre_ray:
+                t, p, face = _nearest(scene, origin, ray, 1e4, work[0], work[1])
+                if middle:
                     depth[row, col] = t if p >= 0 else 0.0
-                    continue
-                if p < 0:
-                    for c in range(3):
-                        color[row, col, c] += sky[c]
-                    continue
-                _local(rotation[p], centre[p], half[p], origin, ray, o, d)
-                for i in range(3):
-                    q[i] = o[i] + t * d[i]
-                    point[i] = origin[i] + t * ray[i]
-                _surface(kind[p], half[p], face, q, normal, uv)
-                length = np.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
-                facing = 0.0
-                for i in range(3):
-                    world_n[i] = rotation[p, 0, i] * normal[0] + rotation[p, 1, i] * normal[1] + rotation[p, 2, i] * normal[2]
-                    facing -= world_n[i] * ray[i] / length
-                footprint = t * pixel_angle * texel[p] * size / max(0.15, facing)
-                _texture(mips[texture[p, face]], uv[0] * texel[p], uv[1] * texel[p], np.log2(max(1e-6, footprint)), rgb)
-                light, shine = ambient, 0.0
-                for k in range(lights.shape[0]):
-                    dist = lam = half_dot = 0.0
-                    for i in range(3):
-                        to_light[i] = lights[k, i] - point[i]
-                        dist += to_light[i] ** 2
-                    dist = np.sqrt(dist) + 1e-6
-                    for i in range(3):
-                        lam += to_light[i] / dist * world_n[i]
-                    if lam <= 0:
-                        continue
-                    if k == 0:
-                        for i in range(3):
-                            point[i] += 1e-3 * world_n[i]
-                        _, blocker, _ = _nearest(kind, rotation, centre, half, point, to_light, 1.0, o, d)
-                        for i in range(3):
-                            point[i] -= 1e-3 * world_n[i]
-                        if blocker >= 0 and kind[blocker] != ROOM:
-                            continue
-                    light += (1 - ambient) * lam / lights.shape[0] * 1.6
-                    if gloss[p] > 0:
-                        norm = 0.0
-                        for i in range(3):
-                            h = to_light[i] / dist - ray[i] / length
-                            half_dot += h * world_n[i]
-                            norm += h * h
-                        shine += gloss[p] * max(0.0, half_dot / np.sqrt(norm + 1e-9)) ** 40
-                for c in range(3):
-                    color[row, col, c] += rgb[c] * tint[p, c] * light + shine
-            for c in range(3):
-                color[row, col, c] /= samples * samples
+                elif p < 0:
+                    color[row, col] += scene.sky
+                else:
+                    _add_color(scene, origin, ray, (t, p, face), pixel_angle, work, color[row, col])
+            color[row, col] /= samples * samples
     return color, depth
 
 
 def render(
-    scene: Scene, mips: NDArray[np.uint8], K: Floats, world_from_cam: Floats, shape: tuple[int, int], samples: int = 2
+    scene: Scene, K: Floats, world_from_cam: Floats, shape: tuple[int, int], samples: int = 2
 ) -> tuple[Floats, Floats]:
     """One view of a scene.
 
     Args:
         scene: what to render.
-        mips: :func:`mipmaps` of the textures that the scene refers to.
         K: (3, 3) intrinsics in pixels, centre of the first pixel at (0.5, 0.5).
         world_from_cam: (4, 4).
         shape: (H, W).
@@ -282,8 +298,6 @@ def render(
     Returns:
         Linear colour (H, W, 3), about [0, 1], and camera z (H, W), 0 for sky.
     """
-    return _trace(
-        scene.kind, scene.rotation, scene.centre, scene.half, scene.texture, scene.texel, scene.tint, scene.gloss,
-        mips, scene.lights, np.float32(scene.ambient), scene.sky, np.linalg.inv(K.astype(np.float64)),
-        world_from_cam.astype(np.float64), shape, samples,
-    )  # fmt: skip
+    inverse = np.linalg.inv(K.astype(np.float64))
+    color, depth = _trace(scene, inverse, world_from_cam.astype(np.float64), shape, samples)
+    return color, depth

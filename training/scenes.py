@@ -63,10 +63,14 @@ class Builder:
         faces = self.rng.integers(low, high).astype(np.int32)
         if self.rng.random() < 0.6:
             faces[:] = faces[0]
-        texel = float(np.exp(self.rng.uniform(np.log(0.3), np.log(3.0)))) / max(0.15, min(1.5, float(half.max())))
+        texel = float(np.exp(self.rng.uniform(np.log(0.3), np.log(3.0)))) / max(
+            0.15, min(1.5, float(half.max()))
+        )
         tint = self.rng.uniform(0.5, 1.0) * np.clip(self.rng.normal(1, 0.12, 3), 0.4, 1.4)
         gloss = float(self.rng.uniform(0.05, 0.5)) if self.rng.random() < 0.2 else 0.0
-        self.parts.append((kind, tip @ turn, np.asarray(centre, float), np.asarray(half, float), faces, texel, tint, gloss))
+        self.parts.append(
+            (kind, tip @ turn, np.asarray(centre, float), np.asarray(half, float), faces, texel, tint, gloss)
+        )
 
     def scene(self, lights: Vec, ambient: float, sky: Vec) -> Scene:
         """The finished scene."""
@@ -75,7 +79,7 @@ class Builder:
         return Scene(
             np.array(kind, np.int32), np.array(rotation, f), np.array(centre, f), np.array(half, f),
             np.array(texture, np.int32), np.array(texel, f), np.array(tint, f), np.array(gloss, f),
-            lights.astype(f), ambient, sky.astype(f),
+            lights.astype(f), float(ambient), sky.astype(f), bank(),
         )  # fmt: skip
 
 
@@ -97,7 +101,12 @@ def _table(b: Builder, centre: Vec, yaw: float) -> None:
     c, s = np.cos(yaw), np.sin(yaw)
     for sx, sy in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
         x, y = sx * (w - 0.04), sy * (d - 0.04)
-        b.add(BOX, np.array([centre[0] + c * x - s * y, centre[1] + s * x + c * y, h / 2]), np.array([0.025, 0.025, h / 2]), yaw)
+        b.add(
+            BOX,
+            np.array([centre[0] + c * x - s * y, centre[1] + s * x + c * y, h / 2]),
+            np.array([0.025, 0.025, h / 2]),
+            yaw,
+        )
     reach = 0.7 * min(w, d) * np.ones(2)
     _clutter(b, centre, reach, h + 0.02, int(b.rng.integers(0, 7)), (0.03, 0.2))
 
@@ -108,14 +117,25 @@ def _shelf(b: Builder, centre: Vec, yaw: float) -> None:
     levels = int(b.rng.integers(2, 5))
     c, s = np.cos(yaw), np.sin(yaw)
     for side in (-1, 1):
-        b.add(BOX, np.array([centre[0] + side * c * w, centre[1] + side * s * w, h]), np.array([0.015, d, h]), yaw)
+        b.add(
+            BOX,
+            np.array([centre[0] + side * c * w, centre[1] + side * s * w, h]),
+            np.array([0.015, d, h]),
+            yaw,
+        )
     for k in range(levels + 1):
         z = 2 * h * k / levels
         b.add(BOX, np.array([centre[0], centre[1], z]), np.array([w, d, 0.012]), yaw)
         if k < levels:
             for _ in range(int(b.rng.integers(0, 4))):
                 x = b.rng.uniform(-0.8, 0.8) * w
-                half = np.array([b.rng.uniform(0.02, 0.15), d * b.rng.uniform(0.3, 0.9), h / levels * b.rng.uniform(0.3, 0.9)])
+                half = np.array(
+                    [
+                        b.rng.uniform(0.02, 0.15),
+                        d * b.rng.uniform(0.3, 0.9),
+                        h / levels * b.rng.uniform(0.3, 0.9),
+                    ]
+                )
                 b.add(BOX, np.array([centre[0] + c * x, centre[1] + s * x, z + half[2]]), half, yaw)
 
 
@@ -177,18 +197,31 @@ def facade(b: Builder) -> tuple[Vec, Vec, Vec, Vec, float]:
     b.add(BOX, np.array([0, 0.5, high]), np.array([wide, 0.5, high]), b.rng.normal(0, 0.1))
     b.add(BOX, np.array([0, 0, -0.5]), np.array([60, 60, 0.5]))
     nx, nz = int(b.rng.integers(2, 6)), int(b.rng.integers(1, 4))
-    depth, w, h = b.rng.uniform(0.03, 0.4), wide / nx * b.rng.uniform(0.3, 0.8), high / nz * b.rng.uniform(0.2, 0.45)
+    depth, w, h = (
+        b.rng.uniform(0.03, 0.4),
+        wide / nx * b.rng.uniform(0.3, 0.8),
+        high / nz * b.rng.uniform(0.2, 0.45),
+    )
     kind = int(b.rng.choice([BOX, BOX, CYLINDER, ELLIPSOID]))
     for i in range(nx):
         for k in range(nz):
             at = np.array([(2 * i + 1 - nx) * wide / nx, -0.02, (2 * k + 1) * high / nz])
             b.add(kind, at, np.array([w, depth, h]) if kind != CYLINDER else np.array([depth, depth, h]))
     for _ in range(int(b.rng.integers(1, 5))):
-        b.add(BOX, np.array([0, 0, b.rng.uniform(0, 2 * high)]), np.array([wide, b.rng.uniform(0.05, 0.35), b.rng.uniform(0.03, 0.2)]))
+        b.add(
+            BOX,
+            np.array([0, 0, b.rng.uniform(0, 2 * high)]),
+            np.array([wide, b.rng.uniform(0.05, 0.35), b.rng.uniform(0.03, 0.2)]),
+        )
     _clutter(b, np.array([0, -2.0]), np.array([wide, 1.5]), 0.0, int(b.rng.integers(0, 8)), (0.1, 0.9))
     eye = np.array([b.rng.uniform(-0.6, 0.6) * wide, -b.rng.uniform(3, 11), b.rng.uniform(1, 3)])
     target = np.array([b.rng.uniform(-0.5, 0.5) * wide, 0, b.rng.uniform(0.5, 1.2 * high)])
-    lights = np.stack([np.array([*b.rng.uniform(-30, 30, 1), -b.rng.uniform(5, 40), b.rng.uniform(5, 40)]) for _ in range(2)])
+    lights = np.stack(
+        [
+            np.array([*b.rng.uniform(-30, 30, 1), -b.rng.uniform(5, 40), b.rng.uniform(5, 40)])
+            for _ in range(2)
+        ]
+    )
     return eye, target, lights, b.rng.uniform(0.5, 1.0, 3), b.rng.uniform(0.3, 0.8)
 
 
@@ -209,7 +242,13 @@ def thing(b: Builder) -> tuple[Vec, Vec, Vec, Vec, float]:
     turn, far = b.rng.uniform(0, 2 * np.pi), b.rng.uniform(1.6, 3.5)
     eye = np.array([far * np.cos(turn), far * np.sin(turn), b.rng.uniform(0.3, 2.0)])
     lights = np.stack([np.array([*b.rng.uniform(-8, 8, 2), b.rng.uniform(3, 12)]) for _ in range(2)])
-    return eye, np.array([0, 0, b.rng.uniform(0.1, 0.7)]), lights, b.rng.uniform(0.4, 1.0, 3), b.rng.uniform(0.3, 0.8)
+    return (
+        eye,
+        np.array([0, 0, b.rng.uniform(0.1, 0.7)]),
+        lights,
+        b.rng.uniform(0.4, 1.0, 3),
+        b.rng.uniform(0.3, 0.8),
+    )
 
 
 KINDS: dict[str, Callable[[Builder], tuple[Vec, Vec, Vec, Vec, float]]] = {
@@ -250,7 +289,7 @@ def path(rng: Rng, eye: Vec, target: Vec, views: int, distance: float) -> list[V
     poses = [look_at(eye, target, rng.normal(0, 0.08))]
     reach = distance * np.exp(rng.uniform(np.log(0.06), np.log(0.45)))
     turn = rng.uniform(0, 2 * np.pi)
-    for k in range(1, views):
+    for _ in range(1, views):
         a = turn + rng.choice([0, np.pi]) + rng.normal(0, 0.6)
         size = reach * rng.uniform(0.15, 1.0)
         offset = size * np.array([np.cos(a), 0.6 * np.sin(a), 0.35 * rng.normal()])
@@ -263,10 +302,14 @@ def path(rng: Rng, eye: Vec, target: Vec, views: int, distance: float) -> list[V
 def encode(linear: Floats, rng: Rng) -> NDArray[np.uint8]:
     """Gamma-encoded 8-bit colour with the exposure that the brightest fifth asks for."""
     gain = rng.uniform(0.6, 1.05) / (np.quantile(linear, 0.9) + 1e-3)
-    return (255 * np.clip(linear * min(gain, 3.0), 0, 1) ** (1 / rng.uniform(1.4, 2.4)) + 0.5).astype(np.uint8)
+    return (255 * np.clip(linear * min(gain, 3.0), 0, 1) ** (1 / rng.uniform(1.4, 2.4)) + 0.5).astype(
+        np.uint8
+    )
 
 
-def generate(seed: int, views: int = 6, shape: tuple[int, int] = (144, 192), kind: str | None = None) -> Sample:
+def generate(
+    seed: int, views: int = 6, shape: tuple[int, int] = (144, 192), kind: str | None = None
+) -> Sample:
     """Render one random scene; the same seed gives the same sample.
 
     Views in which something is closer than a twentieth of the median depth, or that show nothing
@@ -277,16 +320,17 @@ def generate(seed: int, views: int = 6, shape: tuple[int, int] = (144, 192), kin
     while True:
         builder = Builder(rng, PLAIN + TEXTURED, PLAIN, float(rng.choice([0.05, 0.3, 0.6])))
         eye, target, lights, sky, ambient = KINDS[name](builder)
-        scene, mips = builder.scene(lights, ambient, sky), bank()
+        scene = builder.scene(lights, ambient, sky)
         h, w = shape
         focal = w / (2 * np.tan(np.deg2rad(rng.uniform(42, 80)) / 2))
         K = np.array([[focal, 0, w / 2], [0, focal * rng.uniform(0.98, 1.02), h / 2], [0, 0, 1]], np.float32)
-        _, probe = render(scene, mips, K / np.array([[4], [4], [1]], np.float32), look_at(eye, target).astype(np.float32), (h // 4, w // 4), 1)
+        quarter = K / np.array([[4], [4], [1]], np.float32)
+        _, probe = render(scene, quarter, look_at(eye, target).astype(np.float32), (h // 4, w // 4), 1)
         seen = probe[probe > 0]
         if seen.size < 0.5 * probe.size or seen.min() < 0.05 * np.median(seen):
             continue
         poses = path(rng, eye, target, views, float(np.median(seen)))
-        pairs = [render(scene, mips, K, p.astype(np.float32), shape) for p in poses]
+        pairs = [render(scene, K, p.astype(np.float32), shape) for p in poses]
         depth = np.stack([d for _, d in pairs])
         lowest = min((float(d[d > 0].min()) if (d > 0).any() else 0.0) for d in depth)
         if (depth > 0).mean(axis=(1, 2)).min() < 0.5 or lowest < 0.03 * np.median(seen):
@@ -297,7 +341,7 @@ def generate(seed: int, views: int = 6, shape: tuple[int, int] = (144, 192), kin
 
 
 def walk(seed: int, views: int, shape: tuple[int, int]) -> Sample:
-    """A slow walk through one furnished, mostly textured room, which COLMAP can map; for the demo and tests."""
+    """A slow walk through a furnished, mostly textured room, which COLMAP can map; for demo and tests."""
     rng = np.random.default_rng(seed)
     builder = Builder(rng, PLAIN + TEXTURED, PLAIN, 0.1)
     half = np.array([2.4, 2.0, 1.3])
@@ -311,7 +355,7 @@ def walk(seed: int, views: int, shape: tuple[int, int]) -> Sample:
     for t in np.linspace(-1, 1, views):
         eye = np.array([0.75 * t, -1.6 + 0.15 * t * t, 1.35 + 0.1 * np.sin(5 * t)])
         poses.append(look_at(eye, np.array([0.35 * t, 1.4, 0.75])))
-    pairs = [render(scene, bank(), K, p.astype(np.float32), shape) for p in poses]
+    pairs = [render(scene, K, p.astype(np.float32), shape) for p in poses]
     images = encode(np.stack([c for c, _ in pairs]), rng)
     cams = np.stack([np.linalg.inv(p) for p in poses]).astype(np.float32)
     return Sample(images, np.stack([d for _, d in pairs]), np.stack([K] * views), cams)

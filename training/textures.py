@@ -24,7 +24,11 @@ def _palette(rng: np.random.Generator, field: Floats) -> Floats:
     if rng.random() < 0.5:
         grey = stops.mean(1, keepdims=True)
         stops = grey + rng.uniform(0, 0.5) * (stops - grey)
-    t = np.clip((field - np.quantile(field, 0.01)) / (np.quantile(field, 0.99) - np.quantile(field, 0.01) + 1e-6), 0, 1)
+    t = np.clip(
+        (field - np.quantile(field, 0.01)) / (np.quantile(field, 0.99) - np.quantile(field, 0.01) + 1e-6),
+        0,
+        1,
+    )
     at = np.linspace(0, 1, len(stops))
     return np.stack([np.interp(t, at, stops[:, c]) for c in range(3)], -1).astype(np.float32)
 
@@ -49,7 +53,9 @@ def tiles(rng: np.random.Generator, size: int) -> Floats:
     u, v = (x * cols + shift) % cols, y * rows
     shade = rng.normal(0, rng.uniform(0, 0.2), (rows, cols))[np.floor(v).astype(int), np.floor(u).astype(int)]
     joint = rng.uniform(0.01, 0.08)
-    gap = (np.minimum(u % 1, 1 - u % 1) < joint * cols / 8) | (np.minimum(v % 1, 1 - v % 1) < joint * rows / 8)
+    gap = (np.minimum(u % 1, 1 - u % 1) < joint * cols / 8) | (
+        np.minimum(v % 1, 1 - v % 1) < joint * rows / 8
+    )
     image = clouds(rng, size) * 0.4 + rng.uniform(0.1, 0.6, 3) + shade[..., None]
     image[gap] = rng.uniform(0.05, 0.9)
     return np.clip(image, 0, 1).astype(np.float32)
@@ -67,7 +73,9 @@ def shapes(rng: np.random.Generator, size: int) -> Floats:
         w, h = size * np.exp(rng.uniform(np.log(0.01), np.log(0.3), 2))
         inside = (u / w) ** 2 + (v / h) ** 2 < 1 if rng.random() < 0.4 else (abs(u) < w) & (abs(v) < h)
         image[inside] = rng.uniform(0, 1, 3)
-    return (image * (1 + rng.uniform(0, 0.1) * _noise(rng, size, 1.0)[..., None])).clip(0, 1).astype(np.float32)
+    return (
+        (image * (1 + rng.uniform(0, 0.1) * _noise(rng, size, 1.0)[..., None])).clip(0, 1).astype(np.float32)
+    )
 
 
 def writing(rng: np.random.Generator, size: int) -> Floats:

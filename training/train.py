@@ -117,7 +117,11 @@ def losses(net: Sweep, sample: tuple, refined: list[int], sources: int) -> tuple
             world = Stage(inverse, error)
     known = truth > 0
     off = (stage.inverse / truth.clamp_min(1e-6) - 1).abs()[known]
-    figures.update(fine=float(term.detach()), d2=float((off < 0.02).float().mean()), d5=float((off < 0.05).float().mean()))
+    figures.update(
+        fine=float(term.detach()),
+        d2=float((off < 0.02).float().mean()),
+        d5=float((off < 0.05).float().mean()),
+    )
     return total, figures
 
 
@@ -157,7 +161,11 @@ class Trainer:
         """Cosine from the peak to a fiftieth of it, after a linear warm-up."""
         c = self.config
         t = min(1.0, self.step / c.steps)
-        return c.rate * min(1.0, (self.step + 1) / c.warmup) * (0.02 + 0.98 * (0.5 + 0.5 * math.cos(math.pi * t)))
+        return (
+            c.rate
+            * min(1.0, (self.step + 1) / c.warmup)
+            * (0.02 + 0.98 * (0.5 + 0.5 * math.cos(math.pi * t)))
+        )
 
     def one(self) -> dict[str, float] | None:
         """One optimisation step; None if the sample could not be used."""

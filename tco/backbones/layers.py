@@ -1,4 +1,4 @@
-"""Building blocks of the embedded network: convolutions, residuals and a transformer with 2-D rotary positions."""
+"""Building blocks of the embedded network: convolutions, residuals, a transformer with rotary positions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from torch import Tensor, nn
 class Conv(nn.Module):
     """Convolution in two or three dimensions, group normalisation, ReLU."""
 
-    def __init__(self, dims: int, cin: int, cout: int, kernel: int = 3, stride: int = 1, dilation: int = 1) -> None:
+    def __init__(
+        self, dims: int, cin: int, cout: int, kernel: int = 3, stride: int = 1, dilation: int = 1
+    ) -> None:
         super().__init__()
         kind = nn.Conv2d if dims == 2 else nn.Conv3d
         self.conv = kind(cin, cout, kernel, stride, dilation * (kernel // 2), dilation, bias=False)
@@ -43,15 +45,17 @@ class Residual(nn.Module):
         self.a = Conv(dims, channels, channels, dilation=dilation)
         kind = nn.Conv2d if dims == 2 else nn.Conv3d
         self.b = kind(channels, channels, 3, padding=1)
-        nn.init.zeros_(self.b.weight)
-        nn.init.zeros_(self.b.bias)
+        for parameter in self.b.parameters():
+            nn.init.zeros_(parameter)
 
     def forward(self, x: Tensor) -> Tensor:
         """Shape is kept."""
         return x + self.b(self.a(x))
 
 
-def rotary(height: int, width: int, channels: int, like: Tensor, base: float = 100.0) -> tuple[Tensor, Tensor]:
+def rotary(
+    height: int, width: int, channels: int, like: Tensor, base: float = 100.0
+) -> tuple[Tensor, Tensor]:
     """Cosines and sines (H·W, channels) of 2-D rotary positions: half of the channels for y, half for x."""
     quarter = channels // 4
     freq = base ** -(torch.arange(quarter, device=like.device, dtype=like.dtype) / quarter)
@@ -108,7 +112,14 @@ class FeatureNet(nn.Module):
         self.context = nn.Conv2d(24, context, 1)
 
     def forward(self, images: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Images (V, 3, H, W), valid (V, H, W) → coarse (V, ·, H/4, W/4), fine and context at H/2, top at H/16."""
+        """Features of V views.
+
+        Args:
+            images: (V, 3, H, W). valid: (V, H, W).
+
+        Returns:
+            coarse (V, ·, H/4, W/4), fine and context (V, ·, H/2, W/2), top (V, 96, H/16, W/16).
+        """
         weight = valid.unsqueeze(1).to(images.dtype)
         total = weight.sum((2, 3), keepdim=True).clamp_min(1)
         mean = (images * weight).sum((2, 3), keepdim=True) / total

@@ -109,7 +109,7 @@ class Volume(nn.Module):
         b, c, d, h, w = x2.shape
         tokens = torch.cat([x2.reshape(b, c * d, h * w), top.flatten(2)], 1).transpose(1, 2)
         tokens = self.embed(tokens)
-        cos, sin = rotary(h, w, tokens.shape[-1] // self.blocks[0].heads, tokens)  # type: ignore[operator]
+        cos, sin = rotary(h, w, tokens.shape[-1] // self.blocks[0].heads, tokens)
         for block in self.blocks:
             tokens = block(tokens, cos, sin)
         x2 = x2 + self.unembed(self.norm(tokens)).transpose(1, 2).reshape(b, c, d, h, w)
@@ -124,13 +124,18 @@ class Refine(nn.Module):
     def __init__(self, c: SweepConfig, upsample: bool) -> None:
         super().__init__()
         per = c.groups[1] + 3
-        self.stem = nn.Sequential(Conv(2, per * c.hypotheses + c.context + 4, c.hidden), Residual(2, c.hidden))
+        self.stem = nn.Sequential(
+            Conv(2, per * c.hypotheses + c.context + 4, c.hidden), Residual(2, c.hidden)
+        )
         self.body = nn.Sequential(Residual(2, c.hidden, 2), Residual(2, c.hidden, 4), Residual(2, c.hidden))
         self.head = nn.Conv2d(c.hidden, c.hypotheses + 2, 3, padding=1)
         self.mask = nn.Sequential(Conv(2, c.hidden + c.context, 32), Pointwise(32, 36)) if upsample else None
 
     def forward(self, x: Tensor, context: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Features (B, ·, h, w) → scores (B, D, h, w), offset and log-error (B, 2, h, w), mask (B, 36, h, w)."""
+        """Features (B, ·, h, w) → scores (B, D, h, w), offset and log-error (B, 2, h, w), mask (B, 36, h, w).
+
+        The mask is for the last pass, which upsamples; None in the others.
+        """
         y = self.body(self.stem(torch.cat([x, context], 1)))
         out = self.head(y)
         mask = None if self.mask is None else self.mask(torch.cat([y, context], 1))
@@ -234,13 +239,15 @@ class Sweep(nn.Module):
         """The same features with other sparse points as hints of some views."""
         h, w = encoded.context.shape[-2:]
         index = torch.tensor(list(points), device=encoded.lo.device)
-        hints = tuple(
+        quarter, half = (
             old.replaced(index, interpolate_points(list(points.values()), (2 * h, 2 * w), s, encoded.lo))
             for old, s in zip(encoded.hints, (4, 2), strict=True)
         )
-        return replace(encoded, hints=hints)
+        return replace(encoded, hints=(quarter, half))
 
-    def _volume(self, features: Tensor, cameras: Cameras, view: int, sources: Tensor, planes: Tensor) -> Tensor:
+    def _volume(
+        self, features: Tensor, cameras: Cameras, view: int, sources: Tensor, planes: Tensor
+    ) -> Tensor:
         """Fused correlations (1, C, D, h, w) of one view with its sources."""
         relative = relative_cameras(cameras, view, sources, 4)
         parts = (
@@ -258,8 +265,12 @@ class Sweep(nn.Module):
         """
         chosen = tuple(range(len(encoded.lo))) if views is None else tuple(views)
         inverse = None if context is None else F.avg_pool2d(1 / context.depth.unsqueeze(1), 2).squeeze(1)
-        error = None if context is None else F.avg_pool2d(1 / (context.confidence - 1).unsqueeze(1), 2).squeeze(1)
-        world = Stage(inverse, (ERROR_UNIT * error).log()) if inverse is not None and error is not None else None
+        error = (
+            None if context is None else F.avg_pool2d(1 / (context.confidence - 1).unsqueeze(1), 2).squeeze(1)
+        )
+        world = (
+            Stage(inverse, (ERROR_UNIT * error).log()) if inverse is not None and error is not None else None
+        )
         stages = self._coarse_each(encoded, chosen)
         if world is None:
             world = self._others(encoded, chosen, stages)
@@ -286,7 +297,8 @@ class Sweep(nn.Module):
             s = self.coarse(encoded, views[k : k + per])
             assert s.scores is not None
             stages += [
-                Stage(s.inverse[i : i + 1], s.log_error[i : i + 1], s.scores[i : i + 1]) for i in range(len(s.inverse))
+                Stage(s.inverse[i : i + 1], s.log_error[i : i + 1], s.scores[i : i + 1])
+                for i in range(len(s.inverse))
             ]
         return stages
 

@@ -22,7 +22,7 @@ def scaled(K: Tensor, factor: int) -> Tensor:
 
 
 def relative_cameras(cameras: Cameras, view: int, sources: Tensor, factor: int) -> Tensor:
-    """(S, 3, 4) matrices [A | b]: a pixel p of ``view`` at inverse depth w is seen at A p + b w by a source."""
+    """(S, 3, 4) matrices [A | b]: a pixel p of ``view`` at inverse depth w is at A p + b w in a source."""
     K = scaled(cameras.K, factor)
     source_from_view = invert(cameras.world_from_cam[sources]) @ cameras.world_from_cam[view]
     A = K[sources] @ source_from_view[:, :3, :3] @ torch.linalg.inv(K[view])
@@ -52,8 +52,10 @@ def warp_grid(matrix: Tensor, planes: Tensor, height: int, width: int) -> tuple[
     return torch.stack([x, y], -1).clamp(-4, 4), z
 
 
-def correlations(ref: Tensor, source: Tensor, matrix: Tensor, planes: Tensor, groups: int) -> tuple[Tensor, Tensor]:
-    """Group-wise correlation (1, G, D, h, w) of one source with a reference, and where it is seen (1, 1, D, h, w)."""
+def correlations(
+    ref: Tensor, source: Tensor, matrix: Tensor, planes: Tensor, groups: int
+) -> tuple[Tensor, Tensor]:
+    """Group-wise correlation (1, G, D, h, w) of a source with a reference; where seen (1, 1, D, h, w)."""
     _, c, h, w = ref.shape
     with torch.no_grad():
         grid, z = warp_grid(matrix, planes, h, w)
@@ -150,12 +152,16 @@ class Hints:
         """A copy in which some views have the hints of ``other``."""
         parts = (
             a.index_copy(0, views, b)
-            for a, b in ((self.nearest, other.nearest), (self.smooth, other.smooth), (self.distance, other.distance))
+            for a, b in (
+                (self.nearest, other.nearest),
+                (self.smooth, other.smooth),
+                (self.distance, other.distance),
+            )
         )
         return Hints(*parts)
 
     def at(self, planes: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
-        """How well hypotheses (B, D, h, w) fit the points, (B, D, h, w), and the nearest one's offset in steps."""
+        """How hypotheses (B, D, h, w) fit the points, same shape, and their offset in steps (B, 1, h, w)."""
         width = 0.7 + 0.5 * self.distance
         off = (self.nearest.unsqueeze(1) - planes) / step
         bump = torch.exp(-0.5 * (off / width.unsqueeze(1)) ** 2)
@@ -175,7 +181,9 @@ class Hints:
         return torch.stack([*bumps, far, place], 1)
 
 
-def interpolate_points(sparse: Sequence[SparseDepth], size: tuple[int, int], factor: int, like: Tensor) -> Hints:
+def interpolate_points(
+    sparse: Sequence[SparseDepth], size: tuple[int, int], factor: int, like: Tensor
+) -> Hints:
     """Spread the points of each view over a map ``factor`` times smaller than the canvas (H, W).
 
     ``smooth`` is the mean of the six nearest points' inverse depths, weighted by 1 / (1 + d²) / σ.
@@ -185,7 +193,11 @@ def interpolate_points(sparse: Sequence[SparseDepth], size: tuple[int, int], fac
     nearest, smooth, distance = [], [], []
     for points in sparse:
         pick = torch.linspace(0, len(points) - 1, min(len(points), 1500)).round().long()
-        xy, inv, sigma = points.xy[pick].to(like), 1 / points.depth[pick].to(like), points.sigma[pick].to(like)
+        xy, inv, sigma = (
+            points.xy[pick].to(like),
+            1 / points.depth[pick].to(like),
+            points.sigma[pick].to(like),
+        )
         k = min(6, len(pick))
         parts = [torch.cdist(block, xy).topk(k, largest=False) for block in grid.split(8192)]
         d, index = torch.cat([p[0] for p in parts]), torch.cat([p[1] for p in parts])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -30,7 +31,9 @@ def read_file(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         with safe_open(str(path), framework="pt") as f:
             return {name: f.get_tensor(name) for name in f.keys()}, f.metadata() or {}  # noqa: SIM118
     except SafetensorError as error:
-        raise WeightsError(f"{path}: not a complete safetensors file ({error}); fetch or copy it again") from error
+        raise WeightsError(
+            f"{path}: not a complete safetensors file ({error}); fetch or copy it again"
+        ) from error
 
 
 def fill(module: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
@@ -39,13 +42,20 @@ def fill(module: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
     Raises:
         WeightsError: names or shapes differ; the message lists some of them.
     """
-    have, want = {k: tuple(v.shape) for k, v in tensors.items()}, {k: tuple(v.shape) for k, v in module.state_dict().items()}
+    have, want = (
+        {k: tuple(v.shape) for k, v in tensors.items()},
+        {k: tuple(v.shape) for k, v in module.state_dict().items()},
+    )
     if have != want:
         missing, foreign = sorted(want.keys() - have.keys()), sorted(have.keys() - want.keys())
         shapes = [k for k in have.keys() & want.keys() if have[k] != want[k]]
         parts = [
             f"{len(names)} {what} ({', '.join(names[:3])}…)"
-            for what, names in (("missing", missing), ("unknown", foreign), ("of another shape", sorted(shapes)))
+            for what, names in (
+                ("missing", missing),
+                ("unknown", foreign),
+                ("of another shape", sorted(shapes)),
+            )
             if names
         ]
         raise WeightsError(f"{path}: these are not weights of {type(module).__name__}: {'; '.join(parts)}")
@@ -60,12 +70,18 @@ def load_sweep(path: Path = EMBEDDED, device: torch.device | str = "cpu") -> Swe
     """
     tensors, info = read_file(path)
     if "config" not in info:
-        raise WeightsError(f"{path}: no 'config' in its metadata, so these are not weights of the embedded network")
-    sizes = {k: tuple(v) if isinstance(v, list) else v for k, v in json.loads(info["config"]).items()}
+        raise WeightsError(
+            f"{path}: no 'config' in its metadata, so these are not weights of the embedded network"
+        )
+    sizes: dict[str, Any] = {
+        k: tuple(v) if isinstance(v, list) else v for k, v in json.loads(info["config"]).items()
+    }
     try:
         config = SweepConfig(**sizes)
     except TypeError as error:
-        raise WeightsError(f"{path}: its configuration is of another version of the network ({error})") from error
+        raise WeightsError(
+            f"{path}: its configuration is of another version of the network ({error})"
+        ) from error
     network = Sweep(config)
     fill(network, tensors, path)
     return network.eval().requires_grad_(False).to(device)

@@ -30,7 +30,7 @@ from colmap_tco.views import (
     original_from_network,
     undistorted_image,
 )
-from colmap_tco.workspace import WorkspaceConfig, open_workspace
+from colmap_tco.workspace import open_workspace
 from tests.conftest import DISTORTIONS
 
 SIZES = [(160, 120), (96, 144)]
