@@ -5,11 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
 from colmap_tco import _pycolmap
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from tco.types import Priors, Views
 
 _pycolmap.load()  # in the order that keeps PNG writing alive, before any test module imports pycolmap
 
@@ -170,3 +176,14 @@ def shot() -> type[Shot]:
 def workspace_folder(tmp_path_factory: pytest.TempPathFactory, make_workspace: Callable[..., Path]) -> Path:
     """A small workspace of five views, for tests that only read."""
     return make_workspace(tmp_path_factory.mktemp("synthetic"), noise=0.2)
+
+
+@pytest.fixture(scope="session")
+def rendered() -> tuple[Views, Priors, Tensor]:
+    """Five 128×96 views of a furnished room, what COLMAP would know, and the true depth (V, H, W)."""
+    from training.dataset import assemble, triangulated
+    from training.scenes import walk
+
+    sample = walk(4, 5, (96, 128))
+    tracks = triangulated(sample, np.random.default_rng(0))
+    return assemble(sample, sample.images.astype(np.float32) / 255, tracks)
