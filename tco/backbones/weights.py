@@ -73,15 +73,23 @@ def load_sweep(path: Path = EMBEDDED, device: torch.device | str = "cpu") -> Swe
         raise WeightsError(
             f"{path}: no 'config' in its metadata, so these are not weights of the embedded network"
         )
-    sizes: dict[str, Any] = {
-        k: tuple(v) if isinstance(v, list) else v for k, v in json.loads(info["config"]).items()
-    }
+    network = Sweep(_sizes(info["config"], path))
+    fill(network, tensors, path)
+    return network.eval().requires_grad_(False).to(device)
+
+
+def _sizes(text: str, path: Path) -> SweepConfig:
+    """The configuration that a file of weights holds as JSON."""
     try:
-        config = SweepConfig(**sizes)
+        sizes: Any = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise WeightsError(f"{path}: its configuration is not JSON, so it is of another program") from error
+    if not isinstance(sizes, dict):
+        raise WeightsError(f"{path}: its configuration is not that of the embedded network")
+    known: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in sizes.items()}
+    try:
+        return SweepConfig(**known)
     except TypeError as error:
         raise WeightsError(
             f"{path}: its configuration is of another version of the network ({error})"
         ) from error
-    network = Sweep(config)
-    fill(network, tensors, path)
-    return network.eval().requires_grad_(False).to(device)
