@@ -43,7 +43,7 @@ class TrainConfig:
     steps: int = 6000
     rate: float = 1e-3
     warmup: int = 150
-    sizes: tuple[tuple[float, int, int], ...] = ((0.0, 96, 128), (0.85, 144, 192))
+    sizes: tuple[tuple[float, int, int], ...] = ((0.0, 96, 128), (0.67, 144, 192))
     refined: int = 3
     average: float = 0.995
     held_out: int = 24
