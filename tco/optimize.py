@@ -35,7 +35,8 @@ class Outcome:
         cameras: of all views, with their corrections.
         corrections: how far each camera went (``CameraCorrections.sizes``); empty if none could move.
         history: the named terms of every step, unweighted, and their weighted sum as ``loss``.
-        rolled_back: steps at which the loss or its gradient was not finite.
+        rolled_back: steps at which the loss or its gradient was not finite; ``config.steps`` among them
+            stands for the prediction after the last.
     """
 
     prediction: Prediction
@@ -122,8 +123,11 @@ class _Run:
             groups.append({"params": list(self.corrections.parameters()), "lr": c.camera_rate})
         self.optimiser = torch.optim.Adam(groups)
         self.parameters = [p for group in groups for p in group["params"]]
-        self.best = [p.detach().clone() for p in self.parameters]
-        self.best_loss = math.inf
+        self.best, self.best_loss = self._state(), math.inf
+
+    def _state(self) -> tuple[list[Tensor], Prediction]:
+        """The parameters and the context as they are now."""
+        return [p.detach().clone() for p in self.parameters], self.context
 
     def cameras(self) -> Cameras:
         """The cameras as they are believed now."""
@@ -138,6 +142,9 @@ class _Run:
                 self.context = self.backbone.decode(self.encoded, context=self.context)
         source = self._next_source()
         terms = self._terms(source)
+        if not terms:
+            self.history.append({"loss": 0.0})
+            return self.history[-1]
         weights = {
             "photometric": c.photometric_weight,
             "consistency": c.consistency_weight,
@@ -162,17 +169,21 @@ class _Run:
             logger.warning(
                 "step %d: the loss or its gradient is not finite; back to the best state so far", number
             )
-            self.rolled_back.append(number)
-            with torch.no_grad():
-                for p, kept in zip(self.parameters, self.best, strict=True):
-                    p.copy_(kept)
+            self._roll_back(number)
             for group in self.optimiser.param_groups:
                 group["lr"] *= 0.5
             return
         if loss < self.best_loss:
-            self.best_loss = loss
-            self.best = [p.detach().clone() for p in self.parameters]
+            self.best, self.best_loss = self._state(), loss
         self.optimiser.step()
+
+    @torch.no_grad()
+    def _roll_back(self, number: int) -> None:
+        """Back to the best state; its context too, since later ones may come from bad parameters."""
+        self.rolled_back.append(number)
+        values, self.context = self.best
+        for p, kept in zip(self.parameters, values, strict=True):
+            p.copy_(kept)
 
     def _next_source(self) -> int:
         """Views in a random order, each once before any comes again."""
@@ -231,9 +242,13 @@ class _Run:
         return terms
 
     def outcome(self) -> Outcome:
-        """Predict all views with the adapted network."""
+        """Predict all views with the adapted network, as the best step had it if the last ruined it."""
         with torch.no_grad():
             prediction = self.backbone.decode(self.encoded, context=self.context)
+            if not bool(torch.isfinite(prediction.depth).all()):
+                logger.warning("the last step gave depths that are not finite; back to the best state")
+                self._roll_back(self.config.steps)
+                prediction = self.backbone.decode(self.encoded, context=self.context)
             cameras = self.cameras()
         cameras = Cameras(cameras.world_from_cam.detach(), cameras.K.detach())
         prediction = replace(

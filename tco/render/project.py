@@ -58,7 +58,7 @@ def project(surfels: Surfels, cameras: Cameras, size: tuple[int, int], near: flo
     frame = torch.cat([axes, surfels.means.unsqueeze(-1)], -1).transpose(-1, -2)
     origin = frame.new_tensor([0.0, 0.0, 1.0]).expand(len(surfels), 3).unsqueeze(-1)
     local = torch.cat([frame, origin], -1).reshape(-1, 4)
-    transforms = (local @ pixels_from_world.transpose(-1, -2)).reshape(-1, len(surfels), 3, 3)
+    transforms = (local @ pixels_from_world.transpose(-1, -2)).reshape(len(cameras), len(surfels), 3, 3)
     columns = transforms.unbind(-1)
     depths = columns[2][..., 2]
     centres, ellipse = _centres(*columns)
