@@ -17,7 +17,7 @@ from colmap_tco.normals import normals_from_depth
 from colmap_tco.outputs import ViewMaps
 from colmap_tco.priors import PriorConfig, build_priors, check_projection, chunk_frame
 from colmap_tco.tracks import Tracks
-from colmap_tco.views import ChunkFrame, View, batch, canvas_size, crop
+from colmap_tco.views import View, batch, canvas_size, crop
 from tco.config import knob
 from tco.options import TCOConfig
 
@@ -101,8 +101,16 @@ def load_network(config: NetworkConfig) -> tuple[Sweep, torch.device]:
 
 
 def free_memory() -> int:
-    """Bytes of memory that are free now, by the operating system."""
-    return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    """Bytes that can be had without swapping.
+
+    On Linux ``MemAvailable``, which, unlike the free pages, counts what the file cache would give back;
+    elsewhere half of what is installed.
+    """
+    meminfo = Path("/proc/meminfo")
+    for line in meminfo.read_text().splitlines() if meminfo.is_file() else ():
+        if line.startswith("MemAvailable:"):
+            return 1024 * int(line.split()[1])
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
 
 
 def chunk_limit(views: Sequence[View], config: NetworkConfig, memory: int) -> int:
@@ -159,7 +167,7 @@ def predict_chunk(
         seed,
         lambda _, terms: report(terms),
     )
-    prediction = outcome.prediction.to("cpu")
+    prediction, moved = outcome.prediction.to("cpu"), outcome.cameras.to("cpu")
     assert priors.optimise.sparse is not None
     used = errors_at_points(prediction, priors.optimise.sparse)
     held = errors_at_points(prediction, priors.held_out)
@@ -178,7 +186,7 @@ def predict_chunk(
             "reprojection_error_pixels": check.per_view.get(view.name),
             "correction": _correction(outcome, i, frame.scale),
         }
-        corrected = corrected_view(view, frame, outcome.cameras.to("cpu"), i)
+        corrected = corrected_view(view, frame.scale, cameras, moved, i)
         results[view.name] = ViewResult(_maps(view, prediction, i, valid, frame.scale), figures, corrected)
     return ChunkResult(results, outcome.history)
 
@@ -202,12 +210,25 @@ def _maps(view: View, prediction: Prediction, i: int, valid: np.ndarray, scale: 
     return ViewMaps(depth, normals_from_depth(depth, view.network), confidence)
 
 
-def corrected_view(view: View, frame: ChunkFrame, cameras: Cameras, i: int) -> View:
-    """The view with the camera that the optimisation arrived at, in COLMAP's frame and units."""
-    local = np.linalg.inv(cameras.world_from_cam[i].double().numpy())
-    R0, t0 = frame.cam_from_world[:, :3], frame.cam_from_world[:, 3]
-    R = local[:3, :3] @ R0
-    t = local[:3, :3] @ t0 + frame.scale * local[:3, 3]
-    factor = float(cameras.K[i, 0, 0]) / view.network.fx
+def corrected_view(view: View, scale: float, before: Cameras, after: Cameras, i: int) -> View:
+    """The view with its camera corrected as camera ``i`` was, in COLMAP's frame and units.
+
+    Only the difference of the two is applied, to COLMAP's camera in float64: the rounding of a chunk's
+    float32 cameras would be metres where the model has the coordinates of a map.
+
+    Args:
+        view: with COLMAP's camera.
+        scale: COLMAP units per unit of the chunk.
+        before: the chunk's cameras as the optimisation was given them.
+        after: as it left them.
+        i: index of the view in the chunk.
+    """
+    old, new = (cameras.world_from_cam[i].double().numpy() for cameras in (before, after))
+    # The rotation nearest to a product of matrices that are orthogonal to float32 alone.
+    u, _, vt = np.linalg.svd(new[:3, :3].T @ old[:3, :3])
+    turn = u @ vt
+    shift = scale * old[:3, :3].T @ (new[:3, 3] - old[:3, 3])
+    R, t = view.cam_from_world[:, :3], view.cam_from_world[:, 3]
+    factor = float(after.K[i, 0, 0]) / float(before.K[i, 0, 0])
     camera = replace(view.camera, fx=view.camera.fx * factor, fy=view.camera.fy * factor)
-    return replace(view, camera=camera, cam_from_world=np.column_stack([R, t]))
+    return replace(view, camera=camera, cam_from_world=np.column_stack([turn @ R, turn @ (t - shift)]))

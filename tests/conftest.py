@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from tco.types import Priors, Views
+    from training.scenes import Sample
 
 _pycolmap.load()  # in the order that keeps PNG writing alive, before any test module imports pycolmap
 
@@ -98,9 +100,18 @@ def look_at(centre: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def write_text_model(
-    folder: Path, shots: Sequence[Shot], poses: np.ndarray, xyz: np.ndarray, noise: float, names: list[str]
+    folder: Path,
+    shots: Sequence[Shot],
+    poses: np.ndarray,
+    xyz: np.ndarray,
+    noise: float,
+    names: list[str],
+    visible: np.ndarray | None = None,
 ) -> None:
-    """COLMAP's text format, written independently of the package; every camera sees what is before it."""
+    """COLMAP's text format, written independently of the package.
+
+    Every camera sees what is before it, or what ``visible`` (V, N) says.
+    """
     pycolmap = _pycolmap.load()
     rng = np.random.default_rng(5)
     folder.mkdir(parents=True)
@@ -112,7 +123,8 @@ def write_text_model(
         cameras.append(f"{i} {shot.model} {camera.width} {camera.height} {params}")
         local = xyz @ pose[:, :3].T + pose[:, 3]
         uv = np.asarray(camera.img_from_cam(local / local[:, 2:])) + noise * rng.normal(size=(len(xyz), 2))
-        seen = np.flatnonzero((local[:, 2] > 0.1) & (uv > 0).all(1) & (uv < shot.size).all(1))
+        inside = (local[:, 2] > 0.1) & (uv > 0).all(1) & (uv < shot.size).all(1)
+        seen = np.flatnonzero(inside if visible is None else inside & visible[i - 1])
         for index, point in enumerate(seen):
             tracks[point].append(f"{i} {index}")
         q = pycolmap.Rotation3d(np.ascontiguousarray(pose[:, :3])).quat
@@ -187,3 +199,79 @@ def rendered() -> tuple[Views, Priors, Tensor]:
     sample = walk(4, 5, (96, 128))
     tracks = triangulated(sample, np.random.default_rng(0))
     return assemble(sample, sample.images.astype(np.float32) / 255, tracks)
+
+
+@dataclass(frozen=True)
+class Room:
+    """A rendered room and the workspace that was made of it.
+
+    Attributes:
+        root: the workspace: PNG images of 320×240, and a model with the true cameras and points.
+        names: of the images.
+        sample: pictures, true depths and true cameras, in the units of the model.
+    """
+
+    root: Path
+    names: tuple[str, ...]
+    sample: Sample
+
+
+ROOM_VIEWS = 7
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Room:
+    """A workspace of a rendered room with exact cameras, exact points and slightly noisy keypoints."""
+    import cv2
+
+    from training.scenes import walk
+
+    root = tmp_path_factory.mktemp("room")
+    sample = walk(4, ROOM_VIEWS, (240, 320))
+    names = tuple(f"view_{i}.png" for i in range(ROOM_VIEWS))
+    (root / "images").mkdir()
+    for name, image in zip(names, sample.images, strict=True):
+        cv2.imwrite(str(root / "images" / name), image[..., ::-1])
+    fx, _, cx, _, fy, cy = sample.K[0, :2].ravel().tolist()
+    shot = Shot((320, 240), "PINHOLE", (fx, fy, cx, cy))
+    xyz, visible = surface_points(sample)
+    poses = sample.cam_from_world[:, :3].astype(np.float64)
+    u, _, vt = np.linalg.svd(poses[:, :, :3])
+    poses[:, :, :3] = u @ vt  # rotations to the precision of float64
+    write_text_model(
+        root / "sparse" / "0", [shot] * ROOM_VIEWS, poses, xyz, 0.15, list(names), visible=visible
+    )
+    return Room(root, names, sample)
+
+
+def surface_points(sample: Sample, each: int = 60) -> tuple[np.ndarray, np.ndarray]:
+    """World points (N, 3) on what the views see, and which views see them (V, N): at least three."""
+    rng = np.random.default_rng(2)
+    points = []
+    for depth, K, pose in zip(sample.depth, sample.K, np.linalg.inv(sample.cam_from_world), strict=True):
+        y, x = rng.integers(2, depth.shape[0] - 2, each), rng.integers(2, depth.shape[1] - 2, each)
+        ray = np.stack([(x + 0.5 - K[0, 2]) / K[0, 0], (y + 0.5 - K[1, 2]) / K[1, 1], np.ones(each)])
+        points.append((pose[:3, :3] @ (ray * depth[y, x]) + pose[:3, 3:]).T)
+    xyz = np.concatenate(points).astype(np.float64)
+    visible = np.stack([sees(sample, view, xyz) for view in range(len(sample.depth))])
+    keep = visible.sum(0) >= 3
+    return xyz[keep], visible[:, keep]
+
+
+def sees(sample: Sample, view: int, xyz: np.ndarray) -> np.ndarray:
+    """Which points (N, 3) are on the surface that a view sees, within 1 %."""
+    local = xyz @ sample.cam_from_world[view, :3, :3].T + sample.cam_from_world[view, :3, 3]
+    z = np.maximum(local[:, 2], 1e-6)
+    x, y = np.floor((local / z[:, None]) @ sample.K[view].T).astype(int)[:, :2].T
+    h, w = sample.depth.shape[1:]
+    inside = (local[:, 2] > 0) & (x >= 0) & (x < w) & (y >= 0) & (y < h)
+    depth = sample.depth[view, y.clip(0, h - 1), x.clip(0, w - 1)]
+    return inside & (np.abs(z / np.maximum(depth, 1e-6) - 1) < 0.01)
+
+
+@pytest.fixture
+def fresh_room(room: Room, tmp_path: Path) -> Room:
+    """A copy of the room's workspace, for tests that write into it."""
+    root = tmp_path / "room"
+    shutil.copytree(room.root, root, ignore=shutil.ignore_patterns("dense-tco", ".dense-tco*"))
+    return Room(root, room.names, room.sample)

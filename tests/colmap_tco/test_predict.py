@@ -1,0 +1,231 @@
+"""One chunk: devices, weights, memory, units, corrected cameras, and what is reported of each view."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+import torch
+
+from colmap_tco.chunks import Chunk
+from colmap_tco.errors import InputError, MissingError
+from colmap_tco.predict import (
+    ChunkResult,
+    NetworkConfig,
+    choose_device,
+    chunk_limit,
+    corrected_view,
+    free_memory,
+    load_network,
+    predict_chunk,
+)
+from colmap_tco.priors import PriorConfig, chunk_frame
+from colmap_tco.tracks import Tracks, read_tracks
+from colmap_tco.views import ChunkFrame, View, ViewConfig, canvas_cameras, make_views
+from colmap_tco.workspace import open_workspace
+from tco.geometry import so3_exp
+from tco.options import TCOConfig
+from tco.types import Cameras
+
+if TYPE_CHECKING:
+    from tests.conftest import Room
+
+
+@dataclass(frozen=True)
+class Input:
+    views: list[View]
+    tracks: Tracks
+
+
+@pytest.fixture(scope="module")
+def known(room: Room) -> Input:
+    workspace = open_workspace(room.root)
+    views, _ = make_views(workspace, ViewConfig(max_image_size=128), 16)
+    return Input(views, read_tracks(workspace.model))
+
+
+def predicted(known: Input, chunk: Chunk, steps: int = 0, holdout: float = 0.2) -> ChunkResult:
+    settings = (PriorConfig(holdout=holdout), TCOConfig(steps=steps), 0)
+    return predict_chunk(
+        load_network(NetworkConfig(device="cpu")), known.tracks, known.views, chunk, settings, lambda _: None
+    )
+
+
+@pytest.mark.parametrize("name", ["cuda:99", "tpu", "gpu please", "cpu:x"])
+def test_a_device_that_is_not_there_is_an_error_with_the_remedy(name: str) -> None:
+    with pytest.raises(MissingError, match=f"--device {name}: not usable here.*--device cpu"):
+        choose_device(name)
+
+
+def test_devices_are_found() -> None:
+    assert choose_device("cpu") == torch.device("cpu")
+    assert choose_device("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def test_weights_that_are_missing_or_foreign_are_an_error(tmp_path: Path) -> None:
+    with pytest.raises(MissingError, match=r"none\.safetensors: no such file"):
+        load_network(NetworkConfig(weights=str(tmp_path / "none.safetensors")))
+    (tmp_path / "page.safetensors").write_text("<html>")
+    with pytest.raises(MissingError, match=r"page\.safetensors: not a complete safetensors file"):
+        load_network(NetworkConfig(weights=str(tmp_path / "page.safetensors")))
+
+
+def test_the_network_is_frozen_and_in_evaluation_mode() -> None:
+    network, device = load_network(NetworkConfig(device="cpu"))
+    assert device == torch.device("cpu")
+    assert not network.training and not any(p.requires_grad for p in network.parameters())
+
+
+def test_free_memory_counts_what_the_file_cache_would_give_back() -> None:
+    page = os.sysconf("SC_PAGE_SIZE")
+    assert 0 < free_memory() <= os.sysconf("SC_PHYS_PAGES") * page
+    meminfo = Path("/proc/meminfo")
+    if not meminfo.exists():
+        pytest.skip("only Linux says how much memory is available")
+    lines = dict(line.split(":") for line in meminfo.read_text().splitlines())
+    assert free_memory() == pytest.approx(1024 * int(lines["MemAvailable"].split()[0]), rel=0.2)
+
+
+def test_chunks_grow_with_the_memory_and_shrink_with_the_images(known: Input) -> None:
+    limits = [
+        chunk_limit(known.views, NetworkConfig(), memory) for memory in np.logspace(6, 13, 40).astype(int)
+    ]
+    assert limits == sorted(limits)
+    assert (limits[0], limits[-1]) == (2, 40)
+    large = [replace(view, network=view.network.resized(1024, 768)) for view in known.views]
+    memory = 2 * 10**9
+    assert chunk_limit(large, NetworkConfig(), memory) < chunk_limit(known.views, NetworkConfig(), memory)
+
+
+def test_the_size_of_a_chunk_can_be_given(known: Input) -> None:
+    for size, expected in ((5, 5), (2, 2), (1, 2), (100, 100)):
+        assert chunk_limit(known.views, NetworkConfig(chunk_size=size), 0) == expected
+
+
+def test_maps_are_in_colmap_units_and_of_the_size_of_the_network_images(known: Input, room: Room) -> None:
+    result = predicted(known, Chunk((1, 3, 4), (2,)))
+    assert sorted(result.views) == [known.views[i].name for i in (1, 3, 4)]  # not those of the context
+    assert result.history == []
+    for index in (1, 3, 4):
+        view = known.views[index]
+        maps = result.views[view.name].maps
+        h, w = view.network.height, view.network.width
+        assert maps.depth.shape == maps.confidence.shape == (h, w)
+        assert maps.normal.shape == (h, w, 3)
+        assert (maps.depth > 0).all() and (maps.confidence >= 1).all()
+        rows = ((np.arange(h) + 0.5) * 240 / h).astype(int)
+        cols = ((np.arange(w) + 0.5) * 320 / w).astype(int)
+        truth = room.sample.depth[index][rows[:, None], cols]
+        assert np.median(np.abs(maps.depth / truth - 1)) < 0.02
+
+
+def test_every_view_is_reported(known: Input) -> None:
+    result = predicted(known, Chunk(tuple(range(7))), holdout=0.3)
+    for view in known.views:
+        figures = result.views[view.name].figures
+        total = figures["points"] + figures["points_held_out"]
+        assert 0.2 < figures["points_held_out"] / total < 0.4
+        assert 0 <= figures["error_at_points"] < 0.03
+        assert 0 <= figures["error_at_held_out"] < 0.03
+        assert 0.7 < figures["held_out_within_5_percent"] <= 1
+        assert figures["reprojection_error_pixels"] < 0.3
+        assert figures["correction"] == {"rotation_degrees": 0.0, "centre": 0.0, "focal": 0.0}
+    everything = predicted(known, Chunk((0, 1, 2)), holdout=0.0).views[known.views[0].name].figures
+    assert everything["points_held_out"] == 0
+    assert everything["error_at_held_out"] is None and everything["held_out_within_5_percent"] is None
+
+
+def scaled(known: Input, factor: float) -> Input:
+    """The same workspace in another unit of length."""
+    tracks = replace(
+        known.tracks,
+        xyz=known.tracks.xyz * factor,
+        covariance=known.tracks.covariance * factor**2,
+        centres={i: c * factor for i, c in known.tracks.centres.items()},
+    )
+    moved = [np.column_stack([v.cam_from_world[:, :3], factor * v.cam_from_world[:, 3]]) for v in known.views]
+    return Input([replace(v, cam_from_world=m) for v, m in zip(known.views, moved, strict=True)], tracks)
+
+
+def test_depth_is_in_the_unit_of_the_model(known: Input) -> None:
+    """A power of two, so that all numbers inside a chunk are the same."""
+    chunk = Chunk((0, 2, 4))
+    a, b = predicted(known, chunk, steps=1), predicted(scaled(known, 1024.0), chunk, steps=1)
+    for name, view in a.views.items():
+        other = b.views[name]
+        np.testing.assert_allclose(other.maps.depth, 1024 * view.maps.depth, rtol=1e-5)
+        assert other.figures["correction"]["centre"] == pytest.approx(
+            1024 * view.figures["correction"]["centre"],
+            rel=1e-3,
+        )
+        np.testing.assert_allclose(
+            other.corrected.cam_from_world[:, :3], view.corrected.cam_from_world[:, :3]
+        )
+
+
+def test_images_that_are_not_those_of_the_model_are_refused(known: Input) -> None:
+    """Poses of one view given to another: the points do not project where its keypoints are."""
+    views = list(known.views)
+    views[0] = replace(views[0], cam_from_world=known.views[6].cam_from_world)
+    views[2] = replace(views[2], cam_from_world=known.views[5].cam_from_world)
+    with pytest.raises(InputError, match="network pixels"):
+        predicted(Input(views, known.tracks), Chunk((0, 1, 2)))
+
+
+def frames(known: Input, origin: float) -> tuple[list[View], ChunkFrame]:
+    """The views and their chunk, moved far from the origin of the world."""
+    views = []
+    for view in known.views[:3]:
+        R, t = view.cam_from_world[:, :3], view.cam_from_world[:, 3]
+        shifted = np.column_stack([R, t - R @ np.array([origin, -2 * origin, 0.1 * origin])])
+        views.append(replace(view, cam_from_world=shifted))
+    scale = chunk_frame(known.tracks, known.views).scale
+    return views, ChunkFrame(views[0].cam_from_world, scale)
+
+
+def centre(view: View) -> np.ndarray:
+    return -view.cam_from_world[:, :3].T @ view.cam_from_world[:, 3]
+
+
+@pytest.mark.parametrize("origin", [0.0, 4.0e6])
+def test_without_a_correction_a_view_keeps_its_camera(known: Input, origin: float) -> None:
+    """To the precision of the numbers in the model, also where coordinates are those of a map."""
+    views, frame = frames(known, origin)
+    cameras = canvas_cameras(views, frame)
+    for i, view in enumerate(views):
+        back = corrected_view(view, frame.scale, cameras, cameras, i)
+        np.testing.assert_allclose(back.cam_from_world[:, :3], view.cam_from_world[:, :3], atol=1e-12)
+        np.testing.assert_allclose(centre(back), centre(view), rtol=0, atol=1e-9 * max(1, origin))
+        assert back.camera == view.camera and back.network == view.network
+
+
+@pytest.mark.parametrize("origin", [0.0, 4.0e6])
+def test_a_correction_moves_the_camera_as_it_says(known: Input, origin: float) -> None:
+    """A turn about the camera's own axes, a shift in the chunk's frame and unit, a longer focal length."""
+    views, frame = frames(known, origin)
+    before = canvas_cameras(views, frame)
+    turn = so3_exp(torch.tensor([0.01, -0.02, 0.03])).expand(3, 3, 3)
+    pose = before.world_from_cam.clone()
+    pose[:, :3, :3] = pose[:, :3, :3] @ turn
+    shift = torch.tensor([0.1, 0.2, -0.05])
+    pose[:, :3, 3] += shift
+    K = before.K.clone()
+    K[:, [0, 1], [0, 1]] *= 1.01
+    for i, view in enumerate(views):
+        got = corrected_view(view, frame.scale, before, Cameras(pose, K), i)
+        relative = got.cam_from_world[:, :3] @ view.cam_from_world[:, :3].T
+        np.testing.assert_allclose(relative, turn[0].T.numpy(), atol=1e-6)
+        np.testing.assert_allclose(
+            got.cam_from_world[:, :3] @ got.cam_from_world[:, :3].T, np.eye(3), atol=1e-12
+        )
+        moved = frame.cam_from_world[:, :3] @ (centre(got) - centre(view))
+        np.testing.assert_allclose(moved, frame.scale * shift.numpy(), atol=1e-5 * frame.scale)
+        np.testing.assert_allclose(
+            [got.camera.fx / view.camera.fx, got.camera.fy / view.camera.fy], 1.01, rtol=1e-6
+        )
+        assert (got.camera.width, got.camera.height) == (view.camera.width, view.camera.height)
+        assert (got.camera.cx, got.camera.cy) == (view.camera.cx, view.camera.cy)
