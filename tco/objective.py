@@ -116,7 +116,8 @@ def consistency(
 
     Each pixel of the source is projected into the targets; with z its depth there and d the target's
     depth sampled bilinearly in inverse depth, e = z / d − 1 costs τ log(1 + |e| / τ): L1 near zero, and
-    indifferent to occlusions, for which e is large. Mean over the projections that fall into a target.
+    indifferent to occlusions, for which e is large. Mean over the projections that fall into a target,
+    weighted by the target's confidence c as an opacity, 1 − 1 / c: a guess is no evidence against another.
 
     Args:
         depth: (H, W) of the source, differentiable.
@@ -138,9 +139,11 @@ def consistency(
     inside = (z > 1e-3) & ((xy >= 0.5) & (xy <= size - 0.5)).all(-1)
     if not bool(inside.any()):
         raise NothingVisibleError(f"no pixel of view {source} falls into one of the views {chosen}")
-    inverse = sample(1 / context.depth[chosen].detach().clamp_min(1e-6).unsqueeze(1), xy)[:, 0]
-    error = (z * inverse - 1).abs()[inside]
-    return (tolerance * torch.log1p(error / tolerance)).mean()
+    trust = 1 - 1 / context.confidence[chosen]
+    maps = torch.stack([1 / context.depth[chosen].clamp_min(1e-6), trust], 1).detach()
+    inverse, weight = (values[inside] for values in sample(maps, xy).unbind(1))
+    error = (z[inside] * inverse - 1).abs()
+    return (weight * tolerance * torch.log1p(error / tolerance)).sum() / weight.sum().clamp_min(1e-6)
 
 
 def weights(rendered: Rendered, depth: Tensor, valid: Tensor | None, config: ObjectiveConfig) -> Tensor:

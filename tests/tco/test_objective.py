@@ -218,6 +218,20 @@ def test_consistency_of_agreeing_depths_is_zero_and_grows_with_the_error() -> No
     assert float(consistency(1.01 * depth, cameras, 0, [1], context)) == pytest.approx(expected)
 
 
+def test_consistency_trusts_targets_by_their_confidence() -> None:
+    """Of two targets, one wrong and of confidence 1, only the other counts."""
+    depth, cameras, context = two_views_of_a_wall(2.0)
+    wrong = replace(
+        context,
+        depth=torch.cat([context.depth, 1.3 * context.depth[1:]]),
+        confidence=torch.cat([context.confidence, torch.ones_like(context.confidence[1:])]),
+    )
+    three = cameras[[0, 1, 1]]
+    assert float(consistency(depth, three, 0, [1, 2], wrong)) == pytest.approx(0, abs=1e-12)
+    trusted = replace(wrong, confidence=2 * torch.ones_like(wrong.confidence))
+    assert float(consistency(depth, three, 0, [1, 2], trusted)) > 0.01
+
+
 def test_consistency_is_indifferent_to_occlusions() -> None:
     """A wall far behind what the target sees pulls at a hundredth of the force of a small error."""
     depth, cameras, context = two_views_of_a_wall(2.0)
