@@ -85,17 +85,24 @@ def choose_device(name: str) -> torch.device:
     return device
 
 
+def weights_file(config: NetworkConfig) -> Path:
+    """The file that ``--weights`` names, or the one in the package."""
+    from tco.backbones.weights import EMBEDDED
+
+    return Path(config.weights).expanduser() if config.weights else EMBEDDED
+
+
 def load_network(config: NetworkConfig) -> tuple[Sweep, torch.device]:
     """The network on its device.
 
     Raises:
         MissingError: no such device, or weights that are missing or of another network.
     """
-    from tco.backbones.weights import EMBEDDED, WeightsError, load_sweep
+    from tco.backbones.weights import WeightsError, load_sweep
 
     device = choose_device(config.device)
     try:
-        return load_sweep(Path(config.weights) if config.weights else EMBEDDED, device), device
+        return load_sweep(weights_file(config), device), device
     except WeightsError as error:
         raise MissingError(str(error)) from error
 
