@@ -24,8 +24,15 @@ from colmap_tco.chunks import ChunkPlan, plan_chunks, source_views
 from colmap_tco.errors import InputError, PartlyDoneError
 from colmap_tco.fusion import FusionConfig, fuse
 from colmap_tco.mapping import MappingConfig, ensure_model
-from colmap_tco.predict import NetworkConfig, chunk_limit, free_memory, load_network, predict_chunk
-from colmap_tco.priors import PriorConfig
+from colmap_tco.predict import (
+    NetworkConfig,
+    chunk_limit,
+    free_memory,
+    load_network,
+    predict_chunk,
+    weights_file,
+)
+from colmap_tco.priors import PriorConfig, with_points
 from colmap_tco.progress import Progress
 from colmap_tco.resume import Result, fingerprint, open_result
 from colmap_tco.tracks import Covisibility, Tracks, covisibility, read_tracks
@@ -98,16 +105,22 @@ def densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified:
     progress.plan(STAGES)
     with clock("workspace"):
         progress.stage("workspace", 1)
-        workspace = _open_or_map(root, config)
         backbone, device = load_network(config.network)
+        workspace = _open_or_map(root, config)
         views, skipped = make_views(workspace, config.views, backbone.stride)
         tracks = read_tracks(workspace.model)
+        views, blind = with_points(tracks, views, config.priors, config.seed)
         pairs = covisibility(tracks, [view.image_id for view in views])
         plan = plan_chunks(pairs.common, chunk_limit(views, config.network, free_memory()))
         result = open_result(root, _fingerprint(workspace, views, config), config.overwrite)
     if result.finished:
         return Densified(result.paths.root, json.loads(result.paths.report.read_text("utf-8")), fresh=False)
-    skipped = {**workspace.skipped, **skipped, **{views[i].name: why for i, why in plan.skipped.items()}}
+    skipped = {
+        **workspace.skipped,
+        **skipped,
+        **blind,
+        **{views[i].name: why for i, why in plan.skipped.items()},
+    }
     with clock("optimisation"), _threads(config.num_threads):
         history = _predict(result, tracks, views, plan, config, (backbone, device), progress)
     used = _used(result, views, config.refine_cameras)
@@ -181,7 +194,8 @@ def _fingerprint(workspace: Workspace, views: Sequence[View], config: DensifyCon
     settings = {"settings": outputs.plain(kept), "versions": _versions()}
     masks = [view.mask_path for view in views if view.mask_path is not None]
     model = [path for path in workspace.model_path.iterdir() if path.suffix in (".bin", ".txt")]
-    return fingerprint(settings, [*model, *masks], [view.path for view in views])
+    contents = [*model, *masks, weights_file(config.network)]
+    return fingerprint(settings, contents, [view.path for view in views])
 
 
 def _predict(
@@ -202,12 +216,13 @@ def _predict(
             r = done.views[view.name]
             outputs.write_view(result.paths, view, r.maps)
             camera = r.corrected.camera
-            figures = {
-                **r.figures,
-                "cam_from_world": r.corrected.cam_from_world,
+            # Rounded like the figures of the report, a camera in map coordinates would be metres off.
+            exact = {
+                "cam_from_world": r.corrected.cam_from_world.tolist(),
                 "focal": [camera.fx, camera.fy],
             }
-            result.mark_done(view.name, outputs.plain(figures))  # type: ignore[arg-type]
+            figures: Any = outputs.plain(r.figures)
+            result.mark_done(view.name, {**figures, **exact})
             progress.advance(1)
     return history
 

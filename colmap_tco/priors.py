@@ -40,6 +40,8 @@ PIXEL_FLOOR = 0.1
 """Poses are not known better than this many pixels of rotation."""
 FOCAL_SIGMA = 0.005
 """Relative uncertainty of a self-calibrated focal length."""
+FEWEST = 4
+"""A view with fewer usable points than this says too little of where its surfaces are."""
 WORST = 8
 
 
@@ -96,6 +98,28 @@ class _Seen:
 
         xy, depth, sigma = (torch.from_numpy(a[keep]).float() for a in (self.xy, self.depth, self.sigma))
         return SparseDepth(xy, depth, sigma, torch.from_numpy(self.track[keep]))
+
+
+def with_points(
+    tracks: Tracks, views: Sequence[View], config: PriorConfig = PriorConfig(), seed: int = 0
+) -> tuple[list[View], dict[str, str]]:
+    """The views with enough points to tell their range of depths, and name → reason for the others.
+
+    Raises:
+        InputError: no view is left.
+    """
+    enough: list[View] = []
+    reasons = {}
+    for view in views:
+        seen, _ = _project(tracks, view, 1.0, (view.network.height, view.network.width))
+        count = int((~held_out(seen.track, config.holdout, seed)).sum())
+        if count >= FEWEST:
+            enough.append(view)
+        else:
+            reasons[view.name] = f"{count} of its 3D points can be used, fewer than {FEWEST}"
+    if not enough:
+        raise InputError(f"no view has {FEWEST} 3D points that can be used; map the images again")
+    return enough, reasons
 
 
 def chunk_frame(tracks: Tracks, views: Sequence[View]) -> ChunkFrame:
