@@ -1,0 +1,498 @@
+"""The whole way from a workspace to its dense result, on a rendered room whose depth is known."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from colmap_tco import _pycolmap
+from colmap_tco.chunks import plan_chunks
+from colmap_tco.cli import main
+from colmap_tco.densify import Densified, DensifyConfig, densify
+from colmap_tco.errors import InputError, PartlyDoneError
+from colmap_tco.maps import read_map
+from colmap_tco.ply import read_ply, read_vis
+from colmap_tco.predict import NetworkConfig
+from colmap_tco.priors import PriorConfig, held_out
+from colmap_tco.progress import Progress
+from colmap_tco.tracks import covisibility, read_tracks
+from colmap_tco.views import ViewConfig
+from colmap_tco.workspace import open_workspace
+from tco.options import TCOConfig
+
+if TYPE_CHECKING:
+    from tests.conftest import Room
+
+ROOT = Path(__file__).resolve().parents[2]
+FLAGS = ("--max_image_size", "128", "--chunk_size", "8", "--device", "cpu")
+"""The settings of :func:`config` on a command line."""
+
+
+def config(steps: int = 0, **changes: Any) -> DensifyConfig:
+    """Small images, so that a run takes seconds."""
+    plain = DensifyConfig(
+        network=NetworkConfig(device="cpu", chunk_size=8),
+        tco=TCOConfig(steps=steps),
+        views=ViewConfig(max_image_size=128),
+    )
+    return replace(plain, **changes)
+
+
+def made(root: Path, settings: DensifyConfig) -> Densified:
+    return densify(root, settings, Progress())
+
+
+def bytes_of(folder: Path, besides: tuple[str, ...] = ("dense-tco", ".dense-tco.partial")) -> dict[str, str]:
+    """Hash and time of change of every file below a folder, leaving out some of its entries."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {
+        str(path.relative_to(folder)): (
+            f"{hashlib.sha256(path.read_bytes()).hexdigest()} {path.stat().st_mtime_ns}"
+        )
+        for path in files
+        if path.relative_to(folder).parts[0] not in besides
+    }
+
+
+@dataclass(frozen=True)
+class Done:
+    """A finished run and what was in the workspace before it."""
+
+    room: Room
+    result: Densified
+    before: dict[str, str]
+
+    @property
+    def dense(self) -> Path:
+        return self.result.folder
+
+
+@pytest.fixture(scope="module")
+def done(room: Room, tmp_path_factory: pytest.TempPathFactory) -> Done:
+    """Two steps of optimisation, for tests that only read."""
+    import shutil
+
+    root = tmp_path_factory.mktemp("done") / "room"
+    shutil.copytree(room.root, root)
+    before = bytes_of(root)
+    return Done(replace(room, root=root), made(root, config(steps=2)), before)
+
+
+def truth(room: Room, view: int, shape: tuple[int, ...]) -> np.ndarray:
+    """True depth (H, W) at the pixel centres of a smaller map."""
+    h, w = room.sample.depth.shape[1:]
+    rows = ((np.arange(shape[0]) + 0.5) * h / shape[0]).astype(int)
+    cols = ((np.arange(shape[1]) + 0.5) * w / shape[1]).astype(int)
+    return room.sample.depth[view][rows[:, None], cols]
+
+
+def assert_accurate(room: Room, dense: Path, within: float = 0.05, share: float = 0.75) -> None:
+    """Most pixels of every depth map are within some per cent of the truth."""
+    for i, name in enumerate(room.names):
+        depth = read_map(dense / "stereo" / "depth_maps" / f"{name}.geometric.bin")
+        error = np.abs(depth / truth(room, i, depth.shape) - 1)
+        assert (error < within).mean() > share, name
+
+
+def test_the_result_is_complete(done: Done) -> None:
+    assert done.dense == done.room.root / "dense-tco"
+    assert done.result.fresh
+    names = done.room.names
+    expected = {f"images/{name}" for name in names}
+    for kind in ("depth", "normal", "confidence"):
+        expected |= {f"stereo/{kind}_maps/{name}.geometric.bin" for name in names}
+    expected |= {"fused.ply", "fused.ply.vis", "report.json", "manifest.json"}
+    expected |= {"stereo/fusion.cfg", "stereo/patch-match.cfg"}
+    found = {path.relative_to(done.dense).as_posix() for path in done.dense.rglob("*") if path.is_file()}
+    model = {f"sparse/{kind}.bin" for kind in ("cameras", "images", "points3D")}
+    assert model <= found
+    rest = {path for path in found if not path.startswith("sparse/")}
+    assert rest == expected
+    assert not (done.room.root / ".dense-tco.partial").exists()
+
+
+def test_nothing_that_the_user_had_is_changed(done: Done) -> None:
+    assert bytes_of(done.room.root) == done.before
+
+
+def test_depth_maps_are_close_to_the_rendered_truth(done: Done) -> None:
+    assert_accurate(done.room, done.dense)
+
+
+def test_normals_are_those_of_the_rendered_surfaces(done: Done) -> None:
+    """The normal of the largest wall, which is a plane of constant world y in this room."""
+    pose = done.room.sample.cam_from_world[3]
+    normal = read_map(done.dense / "stereo" / "normal_maps" / f"{done.room.names[3]}.geometric.bin")
+    assert np.allclose(np.linalg.norm(normal, axis=2)[normal.any(2)], 1, atol=1e-4)
+    world = normal @ pose[:3, :3]
+    axes = np.abs(world).max(2)  # the room and most of its furniture are aligned with the axes
+    assert (axes[normal.any(2)] > 0.98).mean() > 0.4
+    assert (normal[..., 2] < 0.2).mean() > 0.95  # towards the camera
+
+
+def test_the_cloud_lies_on_the_rendered_surfaces(done: Done) -> None:
+    points, normals, colors = read_ply(done.dense / "fused.ply")
+    assert len(points) > 3000 and len(points) == len(normals) == len(colors)
+    sample, errors = done.room.sample, []
+    for pose, K, depth in zip(sample.cam_from_world, sample.K, sample.depth, strict=True):
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        xy = np.floor((local / local[:, 2:]) @ K.T)[:, :2].astype(int)
+        inside = (local[:, 2] > 0.1) & (xy >= 0).all(1) & (xy < (320, 240)).all(1)
+        error = np.full(len(points), np.inf)
+        error[inside] = np.abs(local[inside, 2] / depth[xy[inside, 1], xy[inside, 0]] - 1)
+        errors.append(error)
+    assert (np.min(errors, axis=0) < 0.02).mean() > 0.95
+
+
+def test_colmap_reads_the_result(done: Done) -> None:
+    pycolmap = _pycolmap.load()
+    model = pycolmap.Reconstruction(str(done.dense / "sparse"))
+    original = pycolmap.Reconstruction(str(done.room.root / "sparse" / "0"))
+    assert model.num_reg_images() == len(done.room.names)
+    assert {camera.model.name for camera in model.cameras.values()} == {"PINHOLE"}
+    ours, theirs = (
+        {entry.name: entry.cam_from_world for entry in _pycolmap.registered(m)} for m in (model, original)
+    )
+    for name in done.room.names:
+        np.testing.assert_allclose(ours[name], theirs[name], atol=1e-9)
+        depth = pycolmap.DepthMap()
+        depth.read(str(done.dense / "stereo" / "depth_maps" / f"{name}.geometric.bin"))
+        map_ = read_map(done.dense / "stereo" / "depth_maps" / f"{name}.geometric.bin")
+        np.testing.assert_array_equal(depth.to_array(), map_)
+
+
+def test_visibility_names_views_that_see_the_point(done: Done) -> None:
+    points, _, _ = read_ply(done.dense / "fused.ply")
+    visibility = read_vis(done.dense / "fused.ply.vis")
+    assert len(visibility) == len(points)
+    assert min(len(views) for views in visibility) >= 1
+    assert max(max(views) for views in visibility) < len(done.room.names)
+
+
+def test_the_report_says_what_was_done(done: Done) -> None:
+    report = json.loads((done.dense / "report.json").read_text("utf-8"))
+    assert set(report["views"]) == set(done.room.names)
+    for figures in report["views"].values():
+        assert figures["state"] == "used"
+        assert figures["points"] > 50
+    assert [len(chunk) for chunk in report["loss"]] == [2]
+    assert {"photometric", "consistency", "sparse", "cameras", "loss"} <= report["loss"][0][0].keys()
+    held = report["held_out"]
+    assert held["points"] == sum(v["points_held_out"] for v in report["views"].values()) > 50
+    assert 0.7 < held["within_5_percent"] <= 1 and 0 < held["median_error"] < 0.02
+    assert report["points"] == len(read_ply(done.dense / "fused.ply")[0])
+    assert report["seconds"].keys() == {"workspace", "optimisation", "fusion"}
+    assert report["settings"]["tco"]["steps"] == 2 and report["settings"]["views"]["max_image_size"] == 128
+    assert {"python", "pycolmap", "torch", "numpy"} <= report["versions"].keys()
+    assert report["device"] == "cpu"
+    assert report["workspace"]["model"].endswith("sparse/0")
+
+
+def test_the_summary_names_the_cloud_and_the_quality(done: Done) -> None:
+    text = done.result.summary()
+    assert str(done.dense / "fused.ply") in text and str(done.dense / "report.json") in text
+    assert "held-out points within 5 %" in text and "made" in text
+
+
+def test_a_second_run_says_that_all_is_done_and_changes_nothing(done: Done) -> None:
+    before = bytes_of(done.room.root, besides=())
+    again = made(done.room.root, config(steps=2))
+    assert not again.fresh and "already made" in again.summary()
+    assert again.report == done.result.report
+    threads = config(steps=2)
+    threads = replace(threads, fusion=replace(threads.fusion, num_threads=1))  # decides nothing
+    assert not made(done.room.root, threads).fresh
+    assert bytes_of(done.room.root, besides=()) == before
+
+
+@pytest.mark.parametrize("changes", [{"seed": 1}, {"priors": PriorConfig(holdout=0.2)}])
+def test_other_settings_do_not_replace_a_result_by_themselves(done: Done, changes: dict[str, Any]) -> None:
+    before = bytes_of(done.room.root, besides=())
+    with pytest.raises(InputError, match=r"other settings.*--overwrite"):
+        made(done.room.root, config(steps=2, **changes))
+    assert bytes_of(done.room.root, besides=()) == before
+
+
+def test_overwrite_replaces_a_result(fresh_room: Room) -> None:
+    first = made(fresh_room.root, config())
+    (first.folder / "fused.ply").unlink()
+    second = made(fresh_room.root, config(seed=1, overwrite=True))
+    assert second.fresh and (second.folder / "fused.ply").exists()
+    assert sorted(p.name for p in fresh_room.root.iterdir()) == ["dense-tco", "images", "sparse"]
+    assert not made(fresh_room.root, config(seed=1)).fresh
+
+
+def test_equal_settings_give_equal_results(fresh_room: Room, done: Done) -> None:
+    again = made(fresh_room.root, config(steps=2))
+    same = ("fused.ply", "fused.ply.vis", "stereo/depth_maps/view_2.png.geometric.bin", "sparse/images.bin")
+    for name in same:
+        assert (again.folder / name).read_bytes() == (done.dense / name).read_bytes(), name
+    assert again.report["views"] == done.result.report["views"]
+
+
+def test_without_steps_it_is_the_plain_prediction_in_colmaps_cameras(fresh_room: Room) -> None:
+    result = made(fresh_room.root, config(steps=0))
+    assert_accurate(fresh_room, result.folder)
+    assert result.report["loss"] == [[]]
+    for figures in result.report["views"].values():
+        assert figures["correction"] == {"rotation_degrees": 0.0, "centre": 0.0, "focal": 0.0}
+
+
+def poses(model: Path) -> dict[str, np.ndarray]:
+    return {e.name: e.cam_from_world for e in _pycolmap.registered(_pycolmap.read_model(model))}
+
+
+def test_chunks_give_every_view_once(fresh_room: Room) -> None:
+    network = NetworkConfig(device="cpu", chunk_size=4)
+    result = made(fresh_room.root, config(steps=1, network=network))
+    assert sorted(result.report["views"]) == sorted(fresh_room.names)
+    assert len(result.report["loss"]) > 1
+    assert (result.folder / "stereo" / "fusion.cfg").read_text().split() == list(fresh_room.names)
+    assert_accurate(fresh_room, result.folder, share=0.7)
+
+
+def test_corrected_cameras_are_written_where_asked_for(fresh_room: Room) -> None:
+    """The report says how far each went; without the option the same run keeps COLMAP's."""
+    eager = TCOConfig(steps=2, camera_rate=0.5)
+    result = made(fresh_room.root, config(tco=eager, refine_cameras=True))
+    ours, theirs = poses(result.folder / "sparse"), poses(fresh_room.root / "sparse" / "0")
+    for name, figures in result.report["views"].items():
+        relative = ours[name][:, :3] @ theirs[name][:, :3].T
+        angle = np.degrees(np.linalg.norm(relative - relative.T) / np.sqrt(8))
+        assert angle > 1e-4
+        assert angle == pytest.approx(figures["correction"]["rotation_degrees"], rel=1e-3, abs=1e-6)
+        a, b = (-pose[name][:, :3].T @ pose[name][:, 3] for pose in (ours, theirs))
+        assert np.linalg.norm(a - b) == pytest.approx(figures["correction"]["centre"], rel=1e-3, abs=1e-7)
+    assert_accurate(fresh_room, result.folder)
+
+    kept = made(fresh_room.root, config(tco=eager, overwrite=True))
+    for name, pose in poses(kept.folder / "sparse").items():
+        np.testing.assert_allclose(pose, theirs[name], atol=1e-9)
+    assert kept.report["views"][name]["correction"]["rotation_degrees"] > 1e-4
+
+
+def test_corrected_cameras_keep_the_precision_of_map_coordinates(fresh_room: Room) -> None:
+    """Coordinates of millions: the written centres move by the correction, not by rounding."""
+    model = _pycolmap.read_model(fresh_room.root / "sparse" / "0")
+    pycolmap = _pycolmap.load()
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array([4.1e6, -6.2e5, 300.0])))
+    model.write(str(fresh_room.root / "sparse" / "0"))
+    for text in (fresh_room.root / "sparse" / "0").glob("*.txt"):
+        text.unlink()
+    result = made(fresh_room.root, config(steps=1, refine_cameras=True))
+    ours, theirs = poses(result.folder / "sparse"), poses(fresh_room.root / "sparse" / "0")
+    for name, figures in result.report["views"].items():
+        a, b = (-pose[name][:, :3].T @ pose[name][:, 3] for pose in (ours, theirs))
+        assert np.linalg.norm(a - b) == pytest.approx(figures["correction"]["centre"], rel=0.01, abs=1e-6)
+    assert_accurate(fresh_room, result.folder)
+
+
+def test_images_that_cannot_be_used_are_left_out_and_named(fresh_room: Room) -> None:
+    missing, cut = fresh_room.names[2], fresh_room.names[5]
+    (fresh_room.root / "images" / missing).unlink()
+    path = fresh_room.root / "images" / cut
+    path.write_bytes(path.read_bytes()[:5000])
+    with pytest.raises(PartlyDoneError, match="2 images were left out"):
+        made(fresh_room.root, config())
+    report = json.loads((fresh_room.root / "dense-tco" / "report.json").read_text("utf-8"))
+    states = {name: figures["state"] for name, figures in report["views"].items()}
+    assert states == {n: "skipped" if n in (missing, cut) else "used" for n in fresh_room.names}
+    assert "there is no file" in report["views"][missing]["why"]
+    assert "cannot be decoded" in report["views"][cut]["why"]
+    assert len(read_ply(fresh_room.root / "dense-tco" / "fused.ply")[0]) > 2000
+    assert missing not in poses(fresh_room.root / "dense-tco" / "sparse")
+    assert not made(fresh_room.root, config()).fresh
+
+
+def keep_points_of(root: Path, name: str, kept: Callable[[int], bool], most: int) -> None:
+    """Let one image of a model observe only ``most`` of those points that ``kept`` chooses by their ids."""
+    folder = root / "sparse" / "0"
+    model = _pycolmap.read_model(folder)
+    image = next(image for image in model.images.values() if image.name == name)
+    left = most
+    for index, point in enumerate(image.points2D):
+        if not point.has_point3D():
+            continue
+        if left and kept(point.point3D_id):
+            left -= 1
+        else:
+            model.delete_observation(image.image_id, index)
+    model.write(str(folder))
+    for text in folder.glob("*.txt"):
+        text.unlink()
+
+
+@pytest.mark.parametrize("points", [0, 1, 2])
+def test_a_view_with_hardly_a_point_stops_nothing(fresh_room: Room, points: int) -> None:
+    """Here all points that it sees are held out: none is left to tell its range of depths."""
+    name = fresh_room.names[6]
+    keep_points_of(fresh_room.root, name, lambda key: bool(held_out(np.array([key]), 0.1, 0)[0]), points)
+    with pytest.raises(PartlyDoneError, match="1 images were left out"):
+        made(fresh_room.root, config())
+    report = json.loads((fresh_room.root / "dense-tco" / "report.json").read_text("utf-8"))
+    assert report["views"][name]["state"] == "skipped" and "3D point" in report["views"][name]["why"]
+    assert sum(v["state"] == "used" for v in report["views"].values()) == len(fresh_room.names) - 1
+
+
+def test_masks_leave_holes(fresh_room: Room) -> None:
+    """The left half of one view is masked: no depth there, and the others as ever."""
+    import cv2
+
+    masks = fresh_room.root / "masks"
+    masks.mkdir()
+    mask = np.full((240, 320), 255, np.uint8)
+    mask[:, :160] = 0
+    cv2.imwrite(str(masks / fresh_room.names[1]), mask)
+    views = ViewConfig(max_image_size=128, mask_path=str(masks))
+    result = made(fresh_room.root, config(steps=1, views=views))
+    depth = read_map(result.folder / "stereo" / "depth_maps" / f"{fresh_room.names[1]}.geometric.bin")
+    normal = read_map(result.folder / "stereo" / "normal_maps" / f"{fresh_room.names[1]}.geometric.bin")
+    assert not depth[:, :64].any() and (depth[:, 65:] > 0).all()
+    assert not normal[:, :64].any()
+
+
+def test_a_view_that_is_masked_out_altogether_stops_nothing(fresh_room: Room) -> None:
+    import cv2
+
+    masks = fresh_room.root / "masks"
+    masks.mkdir()
+    cv2.imwrite(str(masks / fresh_room.names[1]), np.zeros((240, 320), np.uint8))
+    views = ViewConfig(max_image_size=128, mask_path=str(masks))
+    result = made(fresh_room.root, config(steps=7, tco=TCOConfig(steps=7), views=views))
+    depth = read_map(result.folder / "stereo" / "depth_maps" / f"{fresh_room.names[1]}.geometric.bin")
+    assert not depth.any()
+    assert result.report["points"] > 2000
+
+
+def finished(root: Path) -> set[str]:
+    """Names of the views that a run in progress has finished."""
+    try:
+        text = (root / ".dense-tco.partial" / "manifest.json").read_text("utf-8")
+    except FileNotFoundError:
+        return set()
+    return set(json.loads(text)["views"])
+
+
+def first_chunk(root: Path, size: int) -> set[str]:
+    """Names of the views that the first chunk owns."""
+    workspace = open_workspace(root)
+    ids = [entry.image_id for entry in workspace.images]
+    plan = plan_chunks(covisibility(read_tracks(workspace.model), ids).common, size)
+    return {workspace.images[i].name for i in plan.chunks[0].owned}
+
+
+@pytest.mark.slow
+def test_a_killed_run_is_continued_by_the_next(fresh_room: Room) -> None:
+    """Killed while the second chunk is optimised: the first is kept, the inputs are untouched."""
+    before, first = bytes_of(fresh_room.root), first_chunk(fresh_room.root, 4)
+    words = ["densify", str(fresh_room.root), *FLAGS, "--chunk_size", "4", "--steps", "3"]
+    command = [sys.executable, "-m", "colmap_tco", *words]
+    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
+        while process.poll() is None and not finished(fresh_room.root) >= first:
+            time.sleep(0.01)
+        os.kill(process.pid, signal.SIGKILL)
+        error = process.communicate()[1]
+    assert process.returncode == -signal.SIGKILL, error
+    assert bytes_of(fresh_room.root) == before
+    assert not (fresh_room.root / "dense-tco").exists()
+    assert finished(fresh_room.root) < set(fresh_room.names)
+    files = [Path("stereo", "depth_maps", f"{name}.geometric.bin") for name in sorted(first)]
+    times = [(fresh_room.root / ".dense-tco.partial" / file).stat().st_mtime_ns for file in files]
+
+    network = NetworkConfig(device="cpu", chunk_size=4)
+    result = made(fresh_room.root, config(steps=3, network=network))
+    assert result.fresh and set(result.report["views"]) == set(fresh_room.names)
+    assert [(result.folder / file).stat().st_mtime_ns for file in files] == times
+    assert not (fresh_room.root / ".dense-tco.partial").exists()
+    assert bytes_of(fresh_room.root) == before
+    assert_accurate(fresh_room, result.folder, share=0.7)
+
+
+@pytest.mark.slow
+def test_a_folder_of_bare_images_is_mapped_first(tmp_path: Path) -> None:
+    """As in the demo: pictures large enough for SIFT, COLMAP's own scale and focal length."""
+    from examples.demo import accuracy, write_images
+    from training.scenes import walk
+
+    sample = walk(4, 6, (480, 640))
+    names = write_images(sample, tmp_path / "images")
+    before = bytes_of(tmp_path)
+    result = made(tmp_path, config())
+    after = bytes_of(tmp_path)
+    assert {name: after[name] for name in before} == before
+    assert {name.split("/")[0] for name in after} == {"images", "sparse", "database.db"}
+    assert set(result.report["views"]) == set(names)
+    assert accuracy(sample, names, result.folder)["within_5_percent"] > 0.65
+
+
+@pytest.fixture
+def command() -> Iterator[Callable[..., int]]:
+    """The command line inside this process; the logging that it sets up is undone."""
+    root = logging.getLogger()
+    handlers, level = list(root.handlers), root.level
+    levels = {name: logging.getLogger(name).level for name in ("colmap_tco", "tco")}
+    yield lambda *words: main([*words])
+    logging.captureWarnings(False)
+    root.handlers[:] = handlers
+    root.setLevel(level)
+    for name, before in levels.items():
+        logging.getLogger(name).setLevel(before)
+
+
+def test_exit_code_0_and_the_summary(
+    command: Callable[..., int], fresh_room: Room, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("densify", str(fresh_room.root), *FLAGS, "--steps", "0")
+    assert command(*words) == 0
+    assert "fused.ply" in capsys.readouterr().out
+    assert command(*words) == 0
+    told = capsys.readouterr()
+    assert "already made" in told.out and "nothing to do" in told.err
+
+
+def test_exit_code_3_without_images_or_folder(
+    command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command("densify", str(tmp_path / "nowhere")) == 3
+    assert "nowhere is not a folder" in capsys.readouterr().err
+    assert command("densify", str(tmp_path)) == 3
+    assert "no pictures" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [(("--device", "cuda:9"), "--device cuda:9"), (("--weights", "none.safetensors"), "none.safetensors")],
+)
+def test_exit_code_5_without_the_device_or_the_weights(
+    command: Callable[..., int], fresh_room: Room, capsys: pytest.CaptureFixture[str], words: tuple[str, str],
+    told: str,
+) -> None:  # fmt: skip
+    """Found out before anything is mapped or written."""
+    import shutil
+
+    shutil.rmtree(fresh_room.root / "sparse")
+    assert command("densify", str(fresh_room.root), *words) == 5
+    assert told in capsys.readouterr().err
+    assert sorted(p.name for p in fresh_room.root.iterdir()) == ["images"]
+
+
+def test_exit_code_6_when_an_image_is_missing(
+    command: Callable[..., int], fresh_room: Room, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (fresh_room.root / "images" / fresh_room.names[0]).unlink()
+    assert command("densify", str(fresh_room.root), *FLAGS, "--steps", "0") == 6
+    assert "1 images were left out" in capsys.readouterr().err
