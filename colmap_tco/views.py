@@ -43,7 +43,7 @@ class ViewConfig:
     """How images are prepared for the network."""
 
     max_image_size: int = knob(
-        640,
+        256,
         "longer side of the images that the network sees, pixels; memory and time grow with its square",
     )
     mask_path: str = knob(

@@ -147,7 +147,7 @@ class _Run:
             return self.history[-1]
         weights = {
             "photometric": c.photometric_weight,
-            "consistency": c.consistency_weight,
+            "consistency": c.consistency_weight if number >= c.consistency_start * c.steps else 0.0,
             "sparse": c.sparse_weight,
             "cameras": c.camera_weight,
         }

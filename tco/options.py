@@ -14,7 +14,7 @@ class TCOConfig:
     steps: int = knob(
         40, "optimisation steps of each chunk; 0 leaves the network as it is (plain feed-forward)"
     )
-    rate: float = knob(1e-3, "learning rate of the adapters (Adam); lower it if the loss jumps")
+    rate: float = knob(2e-3, "learning rate of the adapters (Adam); lower it if the loss jumps")
     lora_rank: int = knob(4, "rank of the adapters; more adapts more and overfits sooner")
     lora_alpha: float = knob(16.0, "adapters are scaled by alpha / rank")
     lora_targets: tuple[str, ...] = knob(
@@ -23,7 +23,7 @@ class TCOConfig:
     photometric_weight: float = knob(
         1.0, "weight of the colours of the rendered surfels; 0 switches rendering off"
     )
-    sparse_weight: float = knob(1.0, "weight of the triangulated points, in inverse depth")
+    sparse_weight: float = knob(0.01, "weight of the triangulated points, in inverse depth")
     consistency_weight: float = knob(1.0, "weight of the agreement with the depths of the other views")
     camera_weight: float = knob(
         1.0, "weight of the pose and focal priors, each in units of its own uncertainty"
@@ -41,13 +41,18 @@ class TCOConfig:
     occlusion_tolerance: float = knob(
         0.02, "a rendered surface further behind the target's own by this share of its depth does not count"
     )
+    consistency_start: float = knob(
+        0.5,
+        "share of the steps after which the depths of the views are tied to each other: earlier, wrong "
+        "depths that agree would hold each other in place against the colours",
+    )
     consistency_tolerance: float = knob(
         0.02, "relative depth difference above which two views' disagreement is weighed less and less"
     )
     exposure: bool = knob(
         True, "match brightness and contrast of each pair of views before comparing colours"
     )
-    structure: float = knob(0.0, "share of the structural term (SSIM) in the comparison of colours")
+    structure: float = knob(0.25, "share of the structural term (SSIM) in the comparison of colours")
     clip: float = knob(1.0, "largest norm of the gradient")
 
     def __post_init__(self) -> None:
