@@ -14,7 +14,7 @@ class TCOConfig:
     steps: int = knob(
         40, "optimisation steps of each chunk; 0 leaves the network as it is (plain feed-forward)"
     )
-    rate: float = knob(2e-3, "learning rate of the adapters (Adam); lower it if the loss jumps")
+    rate: float = knob(1.5e-3, "learning rate of the adapters (Adam); lower it if the loss jumps")
     lora_rank: int = knob(4, "rank of the adapters; more adapts more and overfits sooner")
     lora_alpha: float = knob(16.0, "adapters are scaled by alpha / rank")
     lora_targets: tuple[str, ...] = knob(
@@ -52,7 +52,7 @@ class TCOConfig:
     exposure: bool = knob(
         True, "match brightness and contrast of each pair of views before comparing colours"
     )
-    structure: float = knob(0.25, "share of the structural term (SSIM) in the comparison of colours")
+    structure: float = knob(0.5, "share of the structural term (SSIM) in the comparison of colours")
     clip: float = knob(1.0, "largest norm of the gradient")
 
     def __post_init__(self) -> None:

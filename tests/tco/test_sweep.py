@@ -228,6 +228,9 @@ def test_other_points_change_the_views_that_they_are_of(
     assert torch.equal(network.decode(same).depth, full.depth)
 
     few = network.with_points(encoded, {1: priors.sparse[1][torch.arange(4)]})
+    for old, new in zip(encoded.hints, few.hints, strict=True):  # of both resolutions
+        changed = (old.nearest != new.nearest).flatten(1).any(1)
+        assert changed.tolist() == [False, True, False, False, False]
     before, after = (network.decode(e, [0, 1, 2], full).depth for e in (encoded, few))
     assert torch.equal(before[0], after[0]) and torch.equal(before[2], after[2])
     assert ((before[1] / after[1] - 1).abs() > 0.01).float().mean() > 0.05
