@@ -144,7 +144,7 @@ def test_the_context_matters(network: Sweep, encoded: Encoded, full: Prediction)
     assert ((depth / full.depth[2] - 1).abs() > 0.01).float().mean() > 0.1
 
 
-@pytest.mark.parametrize("scale", [4.0, 0.25, 37.3])
+@pytest.mark.parametrize("scale", [4096.0, 0.25, 37.3])
 def test_depth_scales_with_all_lengths(
     network: Sweep, rendered: Rendered, full: Prediction, scale: float
 ) -> None:
@@ -192,11 +192,14 @@ def test_the_order_of_the_views_permutes_the_result(
 def test_brightness_and_contrast_of_a_view_do_not_matter(
     network: Sweep, rendered: Rendered, full: Prediction
 ) -> None:
-    """Images are whitened first; not exactly, for the variance has a floor."""
+    """Images are whitened before all else; not exactly, for the variance has a floor."""
     views, priors, _ = rendered
     gain = torch.tensor([1.0, 0.8, 0.7, 0.9, 0.75]).view(-1, 1, 1, 1)
     bias = torch.tensor([0.0, 0.1, 0.05, 0.0, 0.2]).view(-1, 1, 1, 1)
     changed = replace(views, images=gain * views.images + bias)
+    maps = [network.features(v.images, v.valid) for v in (views, changed)]
+    for ours, theirs in zip(*maps, strict=True):
+        assert (ours - theirs).abs().mean() < 0.02 * ours.std()
     got = network.decode(network.encode(changed, priors))
     assert_mostly_equal(got.depth, full.depth, 0.01, 0.95)
 
@@ -284,7 +287,8 @@ def test_soft_argmax_of_known_distributions() -> None:
     rows = {
         (0, 0, 0, 0, 1, 0, 0, 0): (4.0, 1.0),
         (0, 0, 0.25, 0.75, 0, 0, 0, 0): (2.75, 1.0),
-        (0, 0.6, 0, 0, 0, 0, 0.4, 0): (1.0, 0.6),  # the other mode is too far away to be mixed in
+        (0, 0.6, 0, 0, 0.4, 0, 0, 0): (1.0, 0.6),  # the other mode is too far away to be mixed in
+        (0, 0.6, 0, 0.4, 0, 0, 0, 0): (1.8, 1.0),
         (0.5, 0.3, 0.2, 0, 0, 0, 0, 0): (0.7, 1.0),
         (0, 0, 0, 0, 0, 0, 0.1, 0.9): (6.9, 1.0),
     }
