@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,9 +52,10 @@ def reprojected(s: Sample, a: int, b: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_a_mirrored_world_projects_to_mirrored_pixels(scene: Sample) -> None:
-    mirror = flipped(scene)
+    off = replace(scene, K=scene.K + np.array([[0, 0, 5], [0, 0, -2], [0, 0, 0]], np.float32))
+    mirror = flipped(off)
     for a, b in ((0, 1), (2, 0), (1, 3)):
-        xy, z = reprojected(scene, a, b)
+        xy, z = reprojected(off, a, b)
         got, theirs = reprojected(mirror, a, b)
         known = scene.depth[a] > 0
         np.testing.assert_allclose(theirs[:, ::-1][known], z[known], rtol=1e-4)
