@@ -148,6 +148,19 @@ def test_training_resumes_where_it_stopped(data: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("_small")
+def test_the_average_follows_closely_at_first_and_slowly_later(data: Path, tmp_path: Path) -> None:
+    """mean ← d · mean + (1 − d) · weights, with d = (step + 1) / (step + 10) up to ``average``."""
+    trainer = Trainer(replace(CONFIG, average=0.6), data, tmp_path)
+    for step, decay in ((0, 0.1), (4, 5 / 14), (30, 0.6)):
+        trainer.step = step
+        before = {k: v.clone() for k, v in trainer.mean.state_dict().items()}
+        assert trainer.one() is not None
+        for name, value in trainer.mean.state_dict().items():
+            expected = decay * before[name] + (1 - decay) * trainer.net.state_dict()[name]
+            torch.testing.assert_close(value, expected, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.usefixtures("_small")
 def test_a_run_ends_with_weights_that_the_package_loads(data: Path, tmp_path: Path) -> None:
     trainer = Trainer(replace(CONFIG, steps=4), data, tmp_path)
     trainer.run(every=2, validation=4)
