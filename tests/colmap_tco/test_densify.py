@@ -251,6 +251,10 @@ def test_without_steps_it_is_the_plain_prediction_in_colmaps_cameras(fresh_room:
         assert figures["correction"] == {"rotation_degrees": 0.0, "centre": 0.0, "focal": 0.0}
 
 
+def keypoints(model: Path, image_id: int) -> np.ndarray:
+    return _pycolmap.observations(_pycolmap.read_model(model), image_id)[0]
+
+
 def poses(model: Path) -> dict[str, np.ndarray]:
     return {e.name: e.cam_from_world for e in _pycolmap.registered(_pycolmap.read_model(model))}
 
@@ -277,6 +281,10 @@ def test_corrected_cameras_are_written_where_asked_for(fresh_room: Room) -> None
         a, b = (-pose[name][:, :3].T @ pose[name][:, 3] for pose in (ours, theirs))
         assert np.linalg.norm(a - b) == pytest.approx(figures["correction"]["centre"], rel=1e-3, abs=1e-7)
     assert_accurate(fresh_room, result.folder)
+    assert result.report["views"][name]["correction"]["focal"] != 0
+    # Keypoints are where they are in the images, which were not drawn anew for the corrected cameras.
+    original = keypoints(fresh_room.root / "sparse" / "0", 3)
+    np.testing.assert_allclose(keypoints(result.folder / "sparse", 3), original, atol=1e-6)
 
     kept = made(fresh_room.root, config(tco=eager, overwrite=True))
     for name, pose in poses(kept.folder / "sparse").items():
