@@ -123,7 +123,7 @@ def free_memory() -> int:
 def chunk_limit(views: Sequence[View], config: NetworkConfig, memory: int) -> int:
     """Views a chunk: what half of the memory holds beside one decoding with gradients, from 2 to 40.
 
-    The figures a pixel were measured with ``benchmarks/memory.py``.
+    The bytes a pixel are estimates on the safe side, from the sizes of the arrays, not measurements.
     """
     if config.chunk_size:
         return max(2, config.chunk_size)
