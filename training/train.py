@@ -13,16 +13,22 @@ import json
 import logging
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
 import torch
+import torch.distributed
+import torch.multiprocessing
 import torch.nn.functional as F
 from safetensors.torch import save_file
 from torch import Tensor
 
-from tco.backbones.sweep import Encoded, Stage, Sweep, _detached, _doubled, _stack
+from tco.backbones.sweep import Encoded, Stage, Sweep
+from tco.backbones.weights import fill, read_file
+from tco.types import Priors, Views
 from training.dataset import load
 
 logger = logging.getLogger(__name__)
@@ -34,29 +40,22 @@ class TrainConfig:
 
     Attributes:
         steps: length of the cosine schedule. rate: peak learning rate. warmup: steps to reach it.
-        sizes: (share of the steps after which it starts, H, W) of the samples.
+        sizes: (share of the steps after which it starts, H, W) of the samples; a quarter keeps the size before.
         refined: views a step whose refinement is trained; all views train the coarse stage.
         average: decay of the moving average of the weights.
+        newest: share of the samples that come from the last folder, where there are several.
         held_out: samples with the lowest numbers, kept for validation.
     """
 
-    steps: int = 6000
+    steps: int = 3400
     rate: float = 1e-3
     warmup: int = 150
-    sizes: tuple[tuple[float, int, int], ...] = ((0.0, 96, 128), (0.67, 144, 192))
+    sizes: tuple[tuple[float, int, int], ...] = ((0.0, 96, 128), (0.6, 144, 192), (0.9, 192, 256))
     refined: int = 3
     average: float = 0.995
-    held_out: int = 24
+    newest: float = 0.6
+    held_out: int = 16
     seed: int = 0
-
-
-def half() -> torch.autocast:
-    """Convolutions and products in bfloat16, twice as fast in three dimensions.
-
-    The refinement stays in float32: there, oneDNN's gradient of a bfloat16 convolution with dilation 4
-    was not finite (torch 2.13), and little time would be won.
-    """
-    return torch.autocast("cpu", torch.bfloat16)
 
 
 def pooled(depth: Tensor, factor: int) -> Tensor:
@@ -69,13 +68,15 @@ def pooled(depth: Tensor, factor: int) -> Tensor:
 
 
 def coarse_loss(stage: Stage, encoded: Encoded, truth: Tensor) -> Tensor:
-    """Cross-entropy over planes, linear between the two nearest, and a clipped L1 on the index."""
+    """Cross-entropy over planes, linear between the two nearest, and a clipped L1 on the index.
+
+    What lies outside the sweep belongs to its first or last plane.
+    """
     assert stage.scores is not None
     lo, step = encoded.lo.view(-1, 1, 1), encoded.step.view(-1, 1, 1)
     planes = stage.scores.shape[1]
-    index = (truth - lo) / step
-    known = (truth > 0) & (index > 0) & (index < planes - 1)
-    index = index.clamp(0, planes - 1.001)
+    known = truth > 0
+    index = ((truth - lo) / step).clamp(0, planes - 1.001)
     below = index.floor().long()
     part = index - below
     logp = stage.scores.log_softmax(1)
@@ -94,22 +95,37 @@ def fine_loss(stage: Stage, truth: Tensor) -> Tensor:
     return ((likelihood + 8 * error.clamp_max(0.25)) * known).sum() / known.sum().clamp_min(1)
 
 
+def slope_loss(stage: Stage, truth: Tensor) -> Tensor:
+    """Mean absolute difference of the slopes of log-depth at spacings of 1, 2 and 4 pixels, clipped.
+
+    Flat surfaces stay flat and edges sharp: an offset common to neighbours costs nothing here.
+    """
+    known = truth > 0
+    off = torch.where(known, stage.inverse.log() - truth.clamp_min(1e-6).log(), torch.zeros_like(truth))
+    total = off.new_zeros(())
+    for s in (1, 2, 4):
+        for dim in (1, 2):
+            n = off.shape[dim] - s
+            both = known.narrow(dim, 0, n) & known.narrow(dim, s, n)
+            slope = (off.narrow(dim, s, n) - off.narrow(dim, 0, n)).abs().clamp_max(0.2)
+            total = total + (slope * both).sum() / both.sum().clamp_min(1)
+    return total
+
+
 def losses(net: Sweep, sample: tuple, refined: list[int], sources: int) -> tuple[Tensor, dict[str, float]]:
     """Total loss of one sample, and figures for the log."""
     views, priors, depth = sample
     encoded = net.encode(views, priors, sources)
-    with half():
-        first = net.coarse(encoded, range(len(views)))
+    first = net.coarse(encoded, range(len(views)))
     total = coarse_loss(first, encoded, pooled(depth, 4))
-    world = _detached(_doubled(first))
-    each = {v: Stage(first.inverse[v : v + 1], first.log_error[v : v + 1]) for v in refined}
+    world = first.detached().doubled()
+    stage = first[torch.tensor(refined)]
     figures = {"coarse": float(total.detach())}
     for k in range(len(net.config.spacing)):
-        each = {v: net.refine(k, encoded, v, s, world) for v, s in each.items()}
-        stage = _stack(list(each.values()))
+        stage = net.refine(k, encoded, refined, stage, world)
         last = k + 1 == len(net.config.spacing)
         truth = pooled(depth[refined], 1 if last else 2)
-        term = fine_loss(stage, truth)
+        term = fine_loss(stage, truth) + 2 * slope_loss(stage, truth)
         total = total + (1.0 if last else 0.5) * term
         if not last:
             inverse, error = world.inverse.clone(), world.log_error.clone()
@@ -126,15 +142,20 @@ def losses(net: Sweep, sample: tuple, refined: list[int], sources: int) -> tuple
 
 
 class Trainer:
-    """Network, its moving average, optimiser and step count; saved and restored as one file."""
+    """Network, its moving average, optimiser and step count; saved and restored as one file.
 
-    def __init__(self, config: TrainConfig, data: Path, out: Path) -> None:
-        self.config, self.data, self.out = config, data, out
+    Several processes, one thread each, take a sample each and average their gradients: on a CPU two
+    threads in one process wait for each other longer than they gain.
+    """
+
+    def __init__(self, config: TrainConfig, data: Sequence[Path], out: Path, rank: int = 0) -> None:
+        self.config, self.data, self.out, self.rank = config, list(data), out, rank
         torch.manual_seed(config.seed)
         self.net = Sweep()
         self.mean = copy.deepcopy(self.net).eval()
         self.optimiser = torch.optim.AdamW(self.net.parameters(), config.rate, weight_decay=1e-4)
         self.step = 0
+        self.refresh()
         out.mkdir(parents=True, exist_ok=True)
         if (out / "state.pt").exists():
             state = torch.load(out / "state.pt", weights_only=True)
@@ -143,6 +164,16 @@ class Trainer:
             self.optimiser.load_state_dict(state["optimiser"])
             self.step = int(state["step"])
             logger.info("resumed at step %d", self.step)
+
+    def start_from(self, weights: Path) -> None:
+        """Take the weights of an earlier training; does nothing to one that was resumed.
+
+        Raises:
+            WeightsError: they are of another network.
+        """
+        if self.step == 0:
+            fill(self.net, read_file(weights)[0], weights)
+            self.mean.load_state_dict(self.net.state_dict())
 
     def save(self) -> None:
         """Write the state and the averaged weights, atomically."""
@@ -167,21 +198,48 @@ class Trainer:
             * (0.02 + 0.98 * (0.5 + 0.5 * math.cos(math.pi * t)))
         )
 
-    def one(self) -> dict[str, float] | None:
-        """One optimisation step; None if the sample could not be used."""
+    def refresh(self) -> None:
+        """List the samples anew: more may have been rendered.
+
+        Raises:
+            SystemExit: a folder has no more samples than are held out of training.
+        """
+        self.files = [sorted(folder.glob("*.npz")) for folder in self.data]
+        for folder, files in zip(self.data, self.files, strict=True):
+            if len(files) <= self.config.held_out:
+                raise SystemExit(
+                    f"{folder}: {len(files)} samples, and {self.config.held_out} are held out; render more "
+                    "with python -m training.dataset"
+                )
+
+    def draw(self) -> tuple[tuple[Views, Priors, Tensor], np.random.Generator]:
+        """A sample of this step and process, and the generator that drew it.
+
+        The largest size is drawn from the last folder alone.
+        """
         c = self.config
-        rng = np.random.default_rng((c.seed, self.step))
-        files = sorted(self.data.glob("*.npz"))[c.held_out :]
-        _, h, w = [s for s in c.sizes if s[0] * c.steps <= self.step][-1]
-        sample = load(files[rng.integers(len(files))], int(rng.integers(2**31)), (h, w))
-        if sample is None:
-            return None
+        rng = np.random.default_rng((c.seed, self.step, self.rank))
+        reached = [s for s in c.sizes if s[0] * c.steps <= self.step]
+        _, h, w = reached[-1 if rng.random() < 0.75 else max(-2, -len(reached))]
+        newest = (h, w) == tuple(c.sizes[-1][1:]) or rng.random() < c.newest
+        folder = self.files[-1] if newest else self.files[rng.integers(len(self.files))]
+        files = folder[c.held_out :]
+        while True:
+            sample = load(files[rng.integers(len(files))], int(rng.integers(2**31)), (h, w))
+            if sample is not None:
+                return sample, rng
+
+    def one(self) -> dict[str, float] | None:
+        """One optimisation step; None if its gradient was not finite."""
+        c = self.config
+        sample, rng = self.draw()
         refined = sorted(rng.choice(len(sample[0]), c.refined, replace=False).tolist())
         for group in self.optimiser.param_groups:
             group["lr"] = self.rate()
         self.optimiser.zero_grad(set_to_none=True)
-        loss, figures = losses(self.net, sample, refined, int(rng.integers(2, 6)))
+        loss, figures = losses(self.net, sample, refined, int(rng.integers(2, len(sample[0]))))
         loss.backward()
+        self.share()
         norm = torch.nn.utils.clip_grad_norm_(self.net.parameters(), 2.0)
         if not torch.isfinite(norm):
             logger.warning("step %d: gradient is not finite, skipped", self.step)
@@ -193,18 +251,30 @@ class Trainer:
                 a.lerp_(b, 1 - decay)
         return figures
 
+    def share(self) -> None:
+        """Average the gradients over the processes."""
+        if not torch.distributed.is_initialized():
+            return
+        grads = [p.grad if p.grad is not None else torch.zeros_like(p) for p in self.net.parameters()]
+        flat = torch.cat([g.reshape(-1) for g in grads])
+        torch.distributed.all_reduce(flat)
+        flat /= torch.distributed.get_world_size()
+        parts = flat.split([g.numel() for g in grads])
+        for p, g in zip(self.net.parameters(), parts, strict=True):
+            p.grad = g.view_as(p)
+
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
         """Mean figures of the averaged weights on the held-out samples."""
         rows = []
-        for path in sorted(self.data.glob("*.npz"))[: self.config.held_out]:
+        for path in (f for files in self.files for f in files[: self.config.held_out]):
             sample = load(path, 7, (96, 128))
             if sample is not None:
                 rows.append(losses(self.mean, sample, [0, 3], 5)[1])
         return {k: float(np.mean([r[k] for r in rows])) for k in rows[0]}
 
     def run(self, every: int = 100, validation: int = 500) -> None:
-        """Train to the end of the schedule."""
+        """Train to the end of the schedule; the first process writes the log and the files."""
         rows: list[dict[str, float]] = []
         start = time.monotonic()
         while self.step < self.config.steps:
@@ -212,15 +282,18 @@ class Trainer:
             self.step += 1
             if figures is not None:
                 rows.append(figures)
-            if self.step % every == 0 and rows:
-                means = {k: float(np.mean([r[k] for r in rows])) for k in rows[0]}
-                self.log("train", means, (time.monotonic() - start) / every)
+            if self.step % every == 0:
+                self.refresh()
+                if self.rank == 0 and rows:
+                    means = {k: float(np.mean([r[k] for r in rows])) for k in rows[0]}
+                    self.log("train", means, (time.monotonic() - start) / every)
+                    self.save()
                 rows, start = [], time.monotonic()
-                self.save()
-            if self.step % validation == 0:
+            if self.step % validation == 0 and self.rank == 0:
                 self.log("valid", self.validate(), 0.0)
                 start = time.monotonic()
-        self.save()
+        if self.rank == 0:
+            self.save()
 
     def log(self, kind: str, figures: dict[str, float], seconds: float) -> None:
         """Append a line to log.csv and to the log."""
@@ -235,17 +308,39 @@ class Trainer:
         logger.info("%d %s %s (%.2f s a step)", self.step, kind, text, seconds)
 
 
+def work(rank: int, config: TrainConfig, args: argparse.Namespace) -> None:
+    """One of the processes."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+    torch.set_num_threads(args.threads)
+    if args.workers > 1:
+        torch.distributed.init_process_group(
+            "gloo", f"file://{(args.out / 'meeting').resolve()}", rank=rank, world_size=args.workers,
+            timeout=timedelta(hours=1),
+        )  # fmt: skip
+    trainer = Trainer(config, args.data, args.out, rank)
+    if args.init is not None:
+        trainer.start_from(args.init)
+    trainer.run()
+
+
 def main() -> None:
     """Command line of the trainer."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--data", type=Path, nargs="+", required=True, help="folders, the largest size last")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--steps", type=int, default=TrainConfig.steps)
-    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--rate", type=float, default=TrainConfig.rate)
+    parser.add_argument("--workers", type=int, default=2, help="processes that share each step")
+    parser.add_argument("--threads", type=int, default=1, help="of each process")
+    parser.add_argument("--init", type=Path, help="weights to start from")
     args = parser.parse_args()
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
-    torch.set_num_threads(args.threads)
-    Trainer(TrainConfig(steps=args.steps), args.data, args.out).run()
+    args.out.mkdir(parents=True, exist_ok=True)
+    (args.out / "meeting").unlink(missing_ok=True)
+    config = TrainConfig(steps=args.steps, rate=args.rate)
+    if args.workers > 1:
+        torch.multiprocessing.spawn(work, (config, args), args.workers)
+    else:
+        work(0, config, args)
 
 
 if __name__ == "__main__":

@@ -2,60 +2,25 @@
 
 Frozen encoder: image features, and per view a volume of group-wise correlations over planes in
 inverse depth, fused over the source views by attention per hypothesis. Adapted decoder: a 3-D
-network with a transformer on its coarsest level turns the volume and the sparse points into depth;
-two passes of a finer sweep refine it, each hypothesis being judged by the features of the source
-views and by the depths that the other views predict.
+network, led by the image and with a transformer on the columns of its volume, turns correlations and
+sparse points into depth; two passes of a finer sweep refine it, each hypothesis being judged by the
+features of the source views and by the depths that the other views predict.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from tco.backbones.layers import Block, Conv, FeatureNet, Pointwise, Residual, rotary
-from tco.backbones.sweeping import (
-    Hints,
-    aggregate,
-    correlations,
-    depth_agreement,
-    interpolate_points,
-    inverse_range,
-    relative_cameras,
-)
+from tco.backbones.decoder import Decoder, SweepConfig, convex_upsample, soft_argmax
+from tco.backbones.layers import FeatureNet
+from tco.backbones.sweeping import Hints, interpolate_points, inverse_range, relative_cameras
+from tco.backbones.warp import agree, correlate
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
-
-
-@dataclass(frozen=True)
-class SweepConfig:
-    """Sizes of the network; stored beside its weights.
-
-    Attributes:
-        planes: hypotheses of the coarse sweep, uniform in inverse depth.
-        groups: correlation groups of the coarse and of the fine sweep.
-        coarse, fine, context: channels of the features.
-        volume: channels of the fused correlation volume.
-        tokens, heads, blocks: transformer on the coarsest level.
-        hypotheses: of each refinement pass.
-        spacing: step of each refinement pass, in coarse planes.
-        hidden: channels of the refinement.
-    """
-
-    planes: int = 48
-    groups: tuple[int, int] = (8, 4)
-    coarse: int = 32
-    fine: int = 16
-    context: int = 24
-    volume: int = 12
-    tokens: int = 192
-    heads: int = 4
-    blocks: int = 3
-    hypotheses: int = 8
-    spacing: tuple[float, ...] = (0.3, 0.08)
-    hidden: int = 40
 
 
 @dataclass(frozen=True)
@@ -63,8 +28,8 @@ class Encoded:
     """What the encoder keeps of V views.
 
     Attributes:
-        volume: (V, C, D, H/4, W/4) fused correlations.
-        fine, context: (V, ·, H/2, W/2). top: (V, ·, H/16, W/16).
+        volume: (V, D, H/4, W/4, C) fused correlations.
+        fine: (V, ·, H/2, W/2). context: (V, ·, …) at 1/2, 1/4, 1/8, 1/16.
         lo, step: (V,) first plane and distance of the planes, in inverse depth.
         sources: (V, S) indices of the source views, best first.
         cameras: of all views.
@@ -73,110 +38,12 @@ class Encoded:
 
     volume: Tensor
     fine: Tensor
-    context: Tensor
-    top: Tensor
+    context: tuple[Tensor, ...]
     lo: Tensor
     step: Tensor
     sources: Tensor
     cameras: Cameras
     hints: tuple[Hints, Hints]
-
-
-class Volume(nn.Module):
-    """Three levels of 3-D convolutions; on the coarsest, each column of the volume is a token."""
-
-    def __init__(self, c: SweepConfig, top: int) -> None:
-        super().__init__()
-        self.planes = c.planes
-        self.stem = Conv(3, c.volume + 4, 12)
-        self.down1 = nn.Sequential(Conv(3, 12, 24, stride=2), Conv(3, 24, 24))
-        self.down2 = nn.Sequential(Conv(3, 24, 32, stride=2), Conv(3, 32, 32))
-        self.embed = nn.Linear(32 * c.planes // 4 + top, c.tokens)
-        self.blocks = nn.ModuleList(Block(c.tokens, c.heads) for _ in range(c.blocks))
-        self.norm = nn.LayerNorm(c.tokens)
-        self.unembed = nn.Linear(c.tokens, 32 * c.planes // 4)
-        self.up1, self.up0 = Pointwise(32, 24), Pointwise(24, 12)
-        self.out1, self.out0 = Conv(3, 24, 24), Conv(3, 12, 12)
-        self.head = nn.Conv3d(12, 1, 3, padding=1)
-        nn.init.zeros_(self.unembed.weight)
-
-    def forward(self, volume: Tensor, hints: Hints, lo: Tensor, step: Tensor, top: Tensor) -> Tensor:
-        """Volume (B, C, D, h, w), points, planes and context → scores (B, D, h, w)."""
-        x = torch.cat([volume, hints.as_volume(lo, step, self.planes)], 1)
-        x0 = self.stem(x.contiguous(memory_format=torch.channels_last_3d))
-        x1 = self.down1(x0)
-        x2 = self.down2(x1)
-        b, c, d, h, w = x2.shape
-        tokens = torch.cat([x2.reshape(b, c * d, h * w), top.flatten(2)], 1).transpose(1, 2)
-        tokens = self.embed(tokens)
-        cos, sin = rotary(h, w, tokens.shape[-1] // self.blocks[0].heads, tokens)
-        for block in self.blocks:
-            tokens = block(tokens, cos, sin)
-        x2 = x2 + self.unembed(self.norm(tokens)).transpose(1, 2).reshape(b, c, d, h, w)
-        x1 = self.out1(x1 + F.interpolate(self.up1(x2), size=x1.shape[2:], mode="trilinear"))
-        x0 = self.out0(x0 + F.interpolate(self.up0(x1), size=x0.shape[2:], mode="trilinear"))
-        return self.head(x0).squeeze(1).float()
-
-
-class Refine(nn.Module):
-    """Chooses among hypotheses around the present depth, at half resolution."""
-
-    def __init__(self, c: SweepConfig, upsample: bool) -> None:
-        super().__init__()
-        per = c.groups[1] + 3
-        self.stem = nn.Sequential(
-            Conv(2, per * c.hypotheses + c.context + 4, c.hidden), Residual(2, c.hidden)
-        )
-        self.body = nn.Sequential(Residual(2, c.hidden, 2), Residual(2, c.hidden, 4), Residual(2, c.hidden))
-        self.head = nn.Conv2d(c.hidden, c.hypotheses + 2, 3, padding=1)
-        self.mask = nn.Sequential(Conv(2, c.hidden + c.context, 32), Pointwise(32, 36)) if upsample else None
-
-    def forward(self, x: Tensor, context: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Features (B, ·, h, w) → scores (B, D, h, w), offset and log-error (B, 2, h, w), mask (B, 36, h, w).
-
-        The mask is for the last pass, which upsamples; None in the others.
-        """
-        y = self.body(self.stem(torch.cat([x, context], 1)))
-        out = self.head(y)
-        mask = None if self.mask is None else self.mask(torch.cat([y, context], 1))
-        return out[:, :-2].float(), out[:, -2:].float(), None if mask is None else mask.float()
-
-
-class Decoder(nn.Module):
-    """Everything that test-time adapters may change."""
-
-    def __init__(self, c: SweepConfig) -> None:
-        super().__init__()
-        self.coarse = Volume(c, 96)
-        self.weigh = nn.Sequential(Pointwise(c.groups[1] * c.hypotheses, 16), nn.ReLU(), Pointwise(16, 1))
-        self.refine = nn.ModuleList(Refine(c, k + 1 == len(c.spacing)) for k in range(len(c.spacing)))
-
-
-def channels_last(module: nn.Module) -> None:
-    """Lay out the weights of convolutions with channels last, twice as fast on a CPU at these sizes."""
-    for m in module.modules():
-        if isinstance(m, nn.Conv3d):
-            m.to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
-        elif isinstance(m, nn.Conv2d):
-            m.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-
-
-def soft_argmax(scores: Tensor, radius: int = 2) -> tuple[Tensor, Tensor]:
-    """Expected plane index around the best one and the probability of that neighbourhood, both (B, h, w)."""
-    p = scores.softmax(1)
-    index = torch.arange(scores.shape[1], device=scores.device, dtype=scores.dtype).view(1, -1, 1, 1)
-    near = (index - scores.detach().argmax(1, keepdim=True)).abs() <= radius
-    p = p * near
-    mass = p.sum(1)
-    return (p * index).sum(1) / mass, mass
-
-
-def convex_upsample(x: Tensor, mask: Tensor) -> Tensor:
-    """(B, 1, h, w) → (B, 2h, 2w), each pixel a convex combination of the 3×3 around it."""
-    b, _, h, w = x.shape
-    weight = mask.reshape(b, 9, 2, 2, h, w).softmax(1)
-    patch = F.unfold(F.pad(x, (1, 1, 1, 1), mode="replicate"), 3).reshape(b, 9, 1, 1, h, w)
-    return (weight * patch).sum(1).permute(0, 3, 1, 4, 2).reshape(b, 2 * h, 2 * w)
 
 
 @dataclass(frozen=True)
@@ -186,6 +53,46 @@ class Stage:
     inverse: Tensor
     log_error: Tensor
     scores: Tensor | None = None
+
+    def __getitem__(self, index: Tensor | slice) -> Stage:
+        scores = None if self.scores is None else self.scores[index]
+        return Stage(self.inverse[index], self.log_error[index], scores)
+
+    def detached(self) -> Stage:
+        """Without gradients and scores."""
+        return Stage(self.inverse.detach(), self.log_error.detach())
+
+    def doubled(self) -> Stage:
+        """At twice the resolution, without scores."""
+        both = torch.stack([self.inverse, self.log_error], 1)
+        inverse, error = F.interpolate(both, scale_factor=2.0, mode="bilinear").unbind(1)
+        return Stage(inverse, error)
+
+
+def joined(stages: Sequence[Stage]) -> Stage:
+    """One batch of several, without scores."""
+    return Stage(torch.cat([s.inverse for s in stages]), torch.cat([s.log_error for s in stages]))
+
+
+def mixed(device: torch.device) -> torch.autocast:
+    """Convolutions and products in bfloat16 where the device multiplies it natively, else in float32.
+
+    Float64 is left alone, so that finite differences can be taken.
+    """
+    if device.type == "cpu":
+        native = torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
+    else:
+        native = device.type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
+    return torch.autocast(device.type, torch.bfloat16, enabled=native)
+
+
+def channels_last(module: nn.Module) -> None:
+    """Lay out the weights of convolutions with channels last, twice as fast on a CPU at these sizes."""
+    for m in module.modules():
+        if isinstance(m, nn.Conv3d):
+            m.to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
+        elif isinstance(m, nn.Conv2d):
+            m.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
 class Sweep(nn.Module):
@@ -199,7 +106,7 @@ class Sweep(nn.Module):
         super().__init__()
         self.config = c = config or SweepConfig()
         self.features = FeatureNet(c.coarse, c.fine, c.context)
-        self.fuse = nn.Sequential(Pointwise(c.groups[0] + 2, 16), nn.ReLU(), Pointwise(16, c.volume + 1))
+        self.fuse = nn.Sequential(nn.Linear(c.groups[0] + 2, 16), nn.ReLU(), nn.Linear(16, c.volume + 1))
         self.head = Decoder(c)
         channels_last(self)
 
@@ -221,23 +128,26 @@ class Sweep(nn.Module):
             raise ValueError("the sweep network needs cameras, sparse points and overlap as priors")
         if len(views) < 2:
             raise ValueError("a plane sweep needs at least two views")
-        coarse, fine, context, top = self.features(views.images, views.valid)
+        with mixed(views.images.device):
+            coarse, fine, context = self.features(views.images, views.valid)
         lo, hi = inverse_range(priors.sparse, views.images)
         step = (hi - lo) / (self.config.planes - 1)
         order = torch.argsort(priors.overlap, dim=1, descending=True, stable=True)
         sources = order[:, : min(max_sources, len(views) - 1)]
-        volumes = []
-        for i in range(len(views)):
-            planes = (lo[i] + step[i] * torch.arange(self.config.planes, device=lo.device)).view(1, -1, 1, 1)
-            volumes.append(self._volume(coarse, priors.cameras, i, sources[i], planes))
-        hints = tuple(interpolate_points(priors.sparse, views.size, s, views.images) for s in (4, 2))
-        return Encoded(
-            torch.cat(volumes), fine, context, top, lo, step, sources, priors.cameras, (hints[0], hints[1])
+        index = torch.arange(self.config.planes, device=lo.device, dtype=lo.dtype)
+        planes = (lo[:, None] + step[:, None] * index)[..., None, None]
+        volume = torch.cat(
+            [
+                self._volume(coarse, priors.cameras, block, sources[block], planes[block])
+                for block in _blocks(range(len(views)), coarse[0, 0].numel() * self.config.planes)
+            ]
         )
+        quarter, half = (interpolate_points(priors.sparse, views.size, s, views.images) for s in (4, 2))
+        return Encoded(volume, fine, context, lo, step, sources, priors.cameras, (quarter, half))
 
     def with_points(self, encoded: Encoded, points: Mapping[int, SparseDepth]) -> Encoded:
         """The same features with other sparse points as hints of some views."""
-        h, w = encoded.context.shape[-2:]
+        h, w = encoded.fine.shape[-2:]
         index = torch.tensor(list(points), device=encoded.lo.device)
         quarter, half = (
             old.replaced(index, interpolate_points(list(points.values()), (2 * h, 2 * w), s, encoded.lo))
@@ -246,15 +156,26 @@ class Sweep(nn.Module):
         return replace(encoded, hints=(quarter, half))
 
     def _volume(
-        self, features: Tensor, cameras: Cameras, view: int, sources: Tensor, planes: Tensor
+        self, features: Tensor, cameras: Cameras, views: Sequence[int], sources: Tensor, planes: Tensor
     ) -> Tensor:
-        """Fused correlations (1, C, D, h, w) of one view with its sources."""
-        relative = relative_cameras(cameras, view, sources, 4)
-        parts = (
-            correlations(features[view : view + 1], features[s : s + 1], m, planes, self.config.groups[0])
-            for s, m in zip(sources.tolist(), relative, strict=True)
-        )
-        return aggregate(parts, self.fuse)
+        """Correlations (B, D, h, w, C) of some views, fused by attention over their sources per hypothesis.
+
+        A softmax accumulated source by source, so that memory does not grow with their number; where no
+        source sees a hypothesis the result is 0.
+        """
+        relative = relative_cameras(cameras, views, sources, 4)
+        reference = torch.as_tensor(list(views), device=sources.device)
+        total = weights = torch.zeros((), device=features.device)
+        for s in range(sources.shape[1]):
+            pairs = torch.stack([reference, sources[:, s]], 1)
+            corr, seen = correlate(features, pairs, relative[:, s], planes, self.config.groups[0])
+            seen = seen.unsqueeze(-1)
+            with mixed(features.device):
+                out = self.fuse(torch.cat([corr, seen, corr.mean(-1, keepdim=True)], -1))
+            weight = out[..., -1:].float().clamp(-8, 8).exp() * seen
+            total = total + weight * out[..., :-1]
+            weights = weights + weight
+        return total / (weights + 1e-6)
 
     def decode(
         self, encoded: Encoded, views: Sequence[int] | None = None, context: Prediction | None = None
@@ -263,123 +184,130 @@ class Sweep(nn.Module):
 
         Without a context the other views' coarse depths are computed here, without gradients.
         """
-        chosen = tuple(range(len(encoded.lo))) if views is None else tuple(views)
-        inverse = None if context is None else F.avg_pool2d(1 / context.depth.unsqueeze(1), 2).squeeze(1)
-        error = (
-            None if context is None else F.avg_pool2d(1 / (context.confidence - 1).unsqueeze(1), 2).squeeze(1)
+        every = range(len(encoded.lo))
+        chosen = tuple(every if views is None else views)
+        stage = self.coarse(encoded, chosen)
+        world = self._others(encoded, chosen, stage) if context is None else _world(context)
+        passes = len(self.config.spacing)
+        for k in range(passes):
+            stage = self.refine(k, encoded, chosen, stage, world)
+            if chosen == tuple(every) and k + 1 < passes:
+                world = stage.detached()
+        return Prediction(
+            1 / stage.inverse, expected_confidence(stage.log_error), encoded.cameras, chosen
         )
-        world = (
-            Stage(inverse, (ERROR_UNIT * error).log()) if inverse is not None and error is not None else None
-        )
-        stages = self._coarse_each(encoded, chosen)
-        if world is None:
-            world = self._others(encoded, chosen, stages)
-        for k in range(len(self.config.spacing)):
-            stages = [self.refine(k, encoded, v, s, world) for v, s in zip(chosen, stages, strict=True)]
-            if len(chosen) == len(encoded.lo) and k + 1 < len(self.config.spacing):
-                world = _detached(_stack(stages))
-        return _prediction(_stack(stages), encoded.cameras, chosen)
 
-    def _others(self, encoded: Encoded, chosen: tuple[int, ...], stages: list[Stage]) -> Stage:
+    def _others(self, encoded: Encoded, chosen: tuple[int, ...], stage: Stage) -> Stage:
         """Coarse stages of all views at half resolution, those not chosen computed now."""
-        done = dict(zip(chosen, stages, strict=True))
-        rest = [v for v in range(len(encoded.lo)) if v not in done]
-        with torch.no_grad():
-            done.update(zip(rest, self._coarse_each(encoded, rest), strict=True))
-        every = [done[v] for v in range(len(encoded.lo))]
-        return _detached(_doubled(_stack(every)))
-
-    def _coarse_each(self, encoded: Encoded, views: Sequence[int]) -> list[Stage]:
-        """Coarse stages view by view, computed in batches of at most ``BATCH`` columns."""
-        per = max(1, BATCH // encoded.volume[0, 0, 0].numel())
-        stages: list[Stage] = []
-        for k in range(0, len(views), per):
-            s = self.coarse(encoded, views[k : k + per])
-            assert s.scores is not None
-            stages += [
-                Stage(s.inverse[i : i + 1], s.log_error[i : i + 1], s.scores[i : i + 1])
-                for i in range(len(s.inverse))
-            ]
-        return stages
+        rest = [v for v in range(len(encoded.lo)) if v not in chosen]
+        order = torch.argsort(torch.tensor([*chosen, *rest]))
+        parts = [stage.detached()]
+        if rest:
+            with torch.no_grad():
+                parts.append(self.coarse(encoded, rest))
+        return joined(parts)[order].doubled()
 
     def coarse(self, encoded: Encoded, views: Sequence[int]) -> Stage:
         """First stage of some views, at 1/4 of the resolution."""
+        blocks = _blocks(views, encoded.volume[0, ..., 0].numel())
+        parts = [self._scores(encoded, block) for block in blocks]
+        scores = torch.cat(parts)
         v = torch.as_tensor(list(views), device=encoded.lo.device)
         lo, step = encoded.lo[v].view(-1, 1, 1), encoded.step[v].view(-1, 1, 1)
-        hints = encoded.hints[0][v]
-        scores = self.head.coarse(encoded.volume[v], hints, lo, step, encoded.top[v])
         index, mass = soft_argmax(scores)
         inverse = lo + step * index
         error = (step / inverse * (0.3 + 3 * (1 - mass))).log()
         return Stage(inverse, error, scores)
 
-    def refine(self, k: int, encoded: Encoded, view: int, stage: Stage, world: Stage) -> Stage:
-        """Pass ``k`` of the refinement of one view, given half-resolution depths of all views."""
-        c = self.config
+    def _scores(self, encoded: Encoded, views: Sequence[int]) -> Tensor:
+        """Plane scores (B, D, h, w) of a few views."""
+        v = torch.as_tensor(list(views), device=encoded.lo.device)
+        lo, step = encoded.lo[v].view(-1, 1, 1), encoded.step[v].view(-1, 1, 1)
+        hints = encoded.hints[0][v].as_volume(lo, step, self.config.planes)
+        volume = torch.cat([encoded.volume[v], hints], -1).permute(0, 4, 1, 2, 3)
+        _, quarter, eighth, sixteenth = (c[v] for c in encoded.context)
+        with mixed(volume.device):
+            scores: Tensor = self.head.coarse(volume, (quarter, eighth, sixteenth))
+        return scores
+
+    def refine(self, k: int, encoded: Encoded, views: Sequence[int], stage: Stage, world: Stage) -> Stage:
+        """Pass ``k`` of the refinement of some views, given half-resolution depths of all views."""
         if stage.inverse.shape[-1] != encoded.fine.shape[-1]:
-            stage = _doubled(stage)
-        step = encoded.step[view] * c.spacing[k]
-        floor = encoded.lo[view] * 0.05
-        start = stage.inverse.detach().clamp_min(floor + step * c.hypotheses / 2)
-        offset = torch.arange(c.hypotheses, device=step.device, dtype=step.dtype) - (c.hypotheses - 1) / 2
-        planes = start.unsqueeze(1) + step * offset.view(1, -1, 1, 1)
-        matching = self._matching(encoded, view, planes)
-        agreement = depth_agreement(
-            planes, encoded.cameras, view, encoded.sources[view], world.inverse, world.log_error
-        )
-        hints = encoded.hints[1][view : view + 1]
+            stage = stage.doubled()
+        blocks = _blocks(views, encoded.fine[0, 0].numel() * self.config.hypotheses)
+        done = 0
+        parts = []
+        for block in blocks:
+            parts.append(self._refined(k, encoded, block, stage[done : done + len(block)], world))
+            done += len(block)
+        return joined(parts)
+
+    def _refined(self, k: int, encoded: Encoded, views: Sequence[int], stage: Stage, world: Stage) -> Stage:
+        """One pass for a few views."""
+        c = self.config
+        v = torch.as_tensor(list(views), device=encoded.lo.device)
+        lo, step = encoded.lo[v].view(-1, 1, 1), encoded.step[v].view(-1, 1, 1) * c.spacing[k]
+        floor = 0.05 * lo
+        lowest = floor + step * c.hypotheses / 2
+        start = stage.inverse.detach().maximum(lowest)
+        index = torch.arange(c.hypotheses, device=step.device, dtype=step.dtype)
+        offset = (index - (c.hypotheses - 1) / 2).view(1, -1, 1, 1)
+        planes = start.unsqueeze(1) + step.unsqueeze(1) * offset
+        relative = relative_cameras(encoded.cameras, views, encoded.sources[v], 2)
+        matching = self._matching(encoded, v, relative, planes)
+        agreement = agree(planes, relative, encoded.sources[v], world.inverse, world.log_error)
+        hints = encoded.hints[1][v]
         bump, near = hints.at(planes, step)
         sure = torch.stack([stage.log_error.detach(), (step / start).log()], 1)
         x = torch.cat([matching, agreement, bump, near, sure, hints.distance.unsqueeze(1)], 1)
         x = x.contiguous(memory_format=torch.channels_last)
-        scores, extra, mask = self.head.refine[k](x, encoded.context[view : view + 1])
-        index = (scores.softmax(1) * offset.view(1, -1, 1, 1)).sum(1) + extra[:, 0]
-        inverse = (stage.inverse.clamp_min(floor + step * c.hypotheses / 2) + step * index).clamp_min(floor)
+        half, quarter, eighth, _ = (m[v] for m in encoded.context)
+        with mixed(x.device):
+            scores, extra, mask = self.head.refine[k](x, (half, quarter, eighth))
+        moved = (scores.softmax(1) * offset).sum(1) + extra[:, 0]
+        inverse = (stage.inverse.maximum(lowest) + step * moved).maximum(floor)
         error = extra[:, 1] + stage.log_error.detach()
         if mask is not None:
             inverse = convex_upsample(inverse.unsqueeze(1), mask)
             error = F.interpolate(error.unsqueeze(1), scale_factor=2.0, mode="bilinear").squeeze(1)
         return Stage(inverse, error)
 
-    def _matching(self, encoded: Encoded, view: int, planes: Tensor) -> Tensor:
-        """Correlations (1, G·D, h, w) at per-pixel hypotheses, averaged over sources by learned weights."""
-        relative = relative_cameras(encoded.cameras, view, encoded.sources[view], 2)
+    def _matching(self, encoded: Encoded, views: Tensor, relative: Tensor, planes: Tensor) -> Tensor:
+        """Correlations (B, D·G, h, w) at per-pixel hypotheses, averaged over sources by learned weights."""
         total = weights = torch.zeros((), device=planes.device)
-        for s, m in zip(encoded.sources[view].tolist(), relative, strict=True):
-            corr, seen = correlations(
-                encoded.fine[view : view + 1], encoded.fine[s : s + 1], m, planes, self.config.groups[1]
+        for s in range(relative.shape[1]):
+            pairs = torch.stack([views, encoded.sources[views, s]], 1)
+            corr, seen = correlate(
+                encoded.fine, pairs, relative[:, s], planes, self.config.groups[1], last=True
             )
-            corr = corr.flatten(1, 2)
-            weight = self.head.weigh(corr).clamp(-8, 8).exp() * seen.mean(2)
+            corr = corr.flatten(3)
+            with mixed(planes.device):
+                score = self.head.weigh(corr)
+            weight = score.float().clamp(-8, 8).exp() * seen.mean(-1, keepdim=True)
             total, weights = total + weight * corr, weights + weight
-        return total / (weights + 1e-6)
+        return (total / (weights + 1e-6)).permute(0, 3, 1, 2)
 
 
-BATCH = 5000
-"""Columns of correlation volumes that are decoded at once: small ones together, large ones alone."""
+BATCH = 400_000
+"""Cells of correlation volumes that are computed at once: small views together, large ones alone."""
 
 ERROR_UNIT = 0.02
 """A relative error of this size has confidence 2, so its surfel is half opaque."""
 
 
-def _prediction(stage: Stage, cameras: Cameras, views: tuple[int, ...]) -> Prediction:
-    return Prediction(1 / stage.inverse, 1 + ERROR_UNIT * (-stage.log_error).exp(), cameras, views)
+def expected_confidence(log_error: Tensor) -> Tensor:
+    """Confidence ≥ 1 of an expected relative error: 1 + ``ERROR_UNIT`` / error."""
+    return 1 + ERROR_UNIT * (-log_error).exp()
 
 
-def _stack(stages: Sequence[Stage]) -> Stage:
-    scores = [s.scores for s in stages if s.scores is not None]
-    return Stage(
-        torch.cat([s.inverse for s in stages]),
-        torch.cat([s.log_error for s in stages]),
-        torch.cat(scores) if scores else None,
-    )
+def _blocks(views: Sequence[int], cells: int) -> Iterator[Sequence[int]]:
+    """The views in groups of at most ``BATCH`` cells, at least one view each."""
+    per = max(1, BATCH // cells)
+    return (views[k : k + per] for k in range(0, len(views), per))
 
 
-def _detached(stage: Stage) -> Stage:
-    return replace(stage, inverse=stage.inverse.detach(), log_error=stage.log_error.detach(), scores=None)
-
-
-def _doubled(stage: Stage) -> Stage:
-    both = torch.stack([stage.inverse, stage.log_error], 1)
-    inverse, error = F.interpolate(both, scale_factor=2.0, mode="bilinear").unbind(1)
-    return Stage(inverse, error)
+def _world(context: Prediction) -> Stage:
+    """A prediction of all views as a stage at half of its resolution."""
+    error = ERROR_UNIT / (context.confidence - 1)
+    inverse, error = F.avg_pool2d(torch.stack([1 / context.depth, error], 1), 2).unbind(1)
+    return Stage(inverse, error.log()).detached()

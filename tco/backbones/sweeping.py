@@ -5,12 +5,11 @@ All functions are differentiable in features; geometry enters as constants.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from tco.geometry import invert, pixel_grid
 from tco.types import Cameras, SparseDepth
@@ -21,103 +20,23 @@ def scaled(K: Tensor, factor: int) -> Tensor:
     return K / K.new_tensor([[factor], [factor], [1.0]])
 
 
-def relative_cameras(cameras: Cameras, view: int, sources: Tensor, factor: int) -> Tensor:
-    """(S, 3, 4) matrices [A | b]: a pixel p of ``view`` at inverse depth w is at A p + b w in a source."""
+def relative_cameras(cameras: Cameras, views: Sequence[int], sources: Tensor, factor: int) -> Tensor:
+    """(B, S, 3, 4) matrices [A | b]: pixel p of a view at inverse depth w is at A p + b w in a source.
+
+    Args:
+        cameras: of all views. views: B of them. sources: (B, S) source views of each.
+        factor: maps are this many times smaller than the views.
+    """
     K = scaled(cameras.K, factor)
-    source_from_view = invert(cameras.world_from_cam[sources]) @ cameras.world_from_cam[view]
-    A = K[sources] @ source_from_view[:, :3, :3] @ torch.linalg.inv(K[view])
-    b = K[sources] @ source_from_view[:, :3, 3:]
+    chosen = list(views)
+    source_from_view = invert(cameras.world_from_cam[sources]) @ cameras.world_from_cam[chosen].unsqueeze(1)
+    A = K[sources] @ source_from_view[..., :3, :3] @ torch.linalg.inv(K[chosen]).unsqueeze(1)
+    b = K[sources] @ source_from_view[..., :3, 3:]
     return torch.cat([A, b], -1)
 
 
-def warp_grid(matrix: Tensor, planes: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Where hypotheses fall in a source view.
-
-    Args:
-        matrix: (3, 4) of :func:`relative_cameras`.
-        planes: inverse depths (1, D, h, w) or (1, D, 1, 1).
-        height, width: size of both maps.
-
-    Returns:
-        Normalised grid (1, D, h, w, 2) for ``grid_sample`` and depth times inverse depth
-        (1, D, h, w), positive in front of the source.
-    """
-    p = pixel_grid(height, width, matrix)
-    ones = torch.ones_like(p[..., :1])
-    base = torch.cat([p, ones], -1) @ matrix[:, :3].T
-    q = base.permute(2, 0, 1)[:, None, None] + matrix[:, 3].view(3, 1, 1, 1, 1) * planes
-    z = q[2]
-    safe = z.clamp_min(1e-4)
-    x, y = q[0] / safe * (2 / width) - 1, q[1] / safe * (2 / height) - 1
-    return torch.stack([x, y], -1).clamp(-4, 4), z
-
-
-def correlations(
-    ref: Tensor, source: Tensor, matrix: Tensor, planes: Tensor, groups: int
-) -> tuple[Tensor, Tensor]:
-    """Group-wise correlation (1, G, D, h, w) of a source with a reference; where seen (1, 1, D, h, w)."""
-    _, c, h, w = ref.shape
-    with torch.no_grad():
-        grid, z = warp_grid(matrix, planes, h, w)
-        seen = ((grid.abs() <= 1).all(-1) & (z > 1e-3)).to(ref.dtype)
-    d = grid.shape[1]
-    warped = F.grid_sample(source, grid.reshape(1, d * h, w, 2), align_corners=False, padding_mode="zeros")
-    product = warped.reshape(1, groups, c // groups, d, h, w) * ref.reshape(1, groups, c // groups, 1, h, w)
-    return product.mean(2), seen.unsqueeze(1)
-
-
-def aggregate(parts: Iterable[tuple[Tensor, Tensor]], fuse: nn.Module) -> Tensor:
-    """Attention over sources per hypothesis: ``fuse`` gives each source's values and its score.
-
-    A softmax accumulated source by source, so that memory does not grow with their number; where no
-    source sees a hypothesis the result is 0.
-    """
-    total, weights = None, None
-    for corr, seen in parts:
-        extra = seen.expand(-1, 1, *corr.shape[2:])
-        out = fuse(torch.cat([corr, extra, corr.mean(1, keepdim=True) * extra], 1))
-        weight = out[:, -1:].clamp(-8, 8).exp() * seen
-        total = weight * out[:, :-1] if total is None else total + weight * out[:, :-1]
-        weights = weight if weights is None else weights + weight
-    if total is None or weights is None:
-        raise ValueError("a plane sweep needs at least one source view")
-    return total / (weights + 1e-6)
-
-
-def depth_agreement(
-    planes: Tensor, cameras: Cameras, view: int, sources: Tensor, inverse: Tensor, log_error: Tensor
-) -> Tensor:
-    """What the other views' depths say of each hypothesis.
-
-    Args:
-        planes: (1, D, h, w) inverse depths.
-        inverse, log_error: (V, h, w) predictions of all views at the same resolution.
-
-    Returns:
-        (1, 2·D, h, w): support (the source's surface is here) and conflict (the source looks
-        through here), each the mean over the sources that see the hypothesis, weighted by confidence.
-    """
-    h, w = planes.shape[-2:]
-    d = planes.shape[1]
-    factor = 2
-    support = conflict = weights = torch.zeros((), device=planes.device)
-    for s, m in zip(sources.tolist(), relative_cameras(cameras, view, sources, factor), strict=True):
-        grid, z = warp_grid(m, planes, h, w)
-        maps = torch.stack([inverse[s], log_error[s]]).unsqueeze(0)
-        values = F.grid_sample(maps, grid.reshape(1, d * h, w, 2), align_corners=False, padding_mode="border")
-        theirs, error = values.reshape(1, 2, d, h, w).unbind(1)
-        gap = (z.clamp_min(1e-4) / planes * theirs).clamp_min(1e-4).log()
-        seen = ((grid.abs() <= 1).all(-1) & (z > 1e-3)).to(planes.dtype)
-        weight = seen * (0.02 / (0.02 + error.exp()))
-        sigma = 0.01 + error.exp().clamp_max(0.1)
-        support = support + weight * torch.exp(-0.5 * (gap / sigma) ** 2)
-        conflict = conflict + weight * torch.sigmoid((-gap - 2 * sigma) / (0.5 * sigma))
-        weights = weights + weight
-    return torch.cat([support, conflict], 1) / (torch.cat([weights, weights], 1) + 1e-3)
-
-
 def inverse_range(sparse: Sequence[SparseDepth], like: Tensor) -> tuple[Tensor, Tensor]:
-    """Smallest and largest inverse depth (V,) to sweep: the points' 1st percentile × 0.75 to the 99th × 1.4.
+    """Smallest and largest inverse depth (V,) to sweep: the points' 1st percentile × 0.7 to the 99th × 2.
 
     Raises:
         ValueError: a view has no sparse point.
@@ -127,8 +46,8 @@ def inverse_range(sparse: Sequence[SparseDepth], like: Tensor) -> tuple[Tensor, 
         if len(points) == 0:
             raise ValueError(f"view {i} has no sparse point, so its depth range is unknown")
         near, far = torch.quantile(points.depth.float(), points.depth.new_tensor([0.01, 0.99]).float())
-        lo.append(1 / (1.4 * far))
-        hi.append(1 / (0.75 * near))
+        lo.append(1 / (2 * far))
+        hi.append(1 / (0.7 * near))
     return torch.stack(lo).to(like), torch.stack(hi).to(like)
 
 
@@ -138,7 +57,7 @@ class Hints:
 
     Attributes:
         nearest, smooth: (V, h, w) inverse depth of the nearest point and of the nearest few, averaged.
-        distance: (V, h, w) log(1 + pixels of the full-size map to the nearest point).
+        distance: (V, h, w) log(1 + r), r the way to the nearest point, the longer side of the map being 160.
     """
 
     nearest: Tensor
@@ -163,13 +82,13 @@ class Hints:
     def at(self, planes: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
         """How hypotheses (B, D, h, w) fit the points, same shape, and their offset in steps (B, 1, h, w)."""
         width = 0.7 + 0.5 * self.distance
-        off = (self.nearest.unsqueeze(1) - planes) / step
+        off = (self.nearest.unsqueeze(1) - planes) / step.unsqueeze(1)
         bump = torch.exp(-0.5 * (off / width.unsqueeze(1)) ** 2)
         middle = planes.mean(1)
         return bump, (((self.smooth - middle) / step).clamp(-12, 12) / 4).unsqueeze(1)
 
     def as_volume(self, lo: Tensor, step: Tensor, planes: int) -> Tensor:
-        """(B, 4, D, h, w): two bumps at the points' planes, the distance, and each plane's place."""
+        """(B, D, h, w, 4): two bumps at the points' planes, the distance, and each plane's place."""
         index = torch.arange(planes, device=lo.device, dtype=lo.dtype).view(1, -1, 1, 1)
         width = (0.7 + 0.35 * self.distance).unsqueeze(1)
         bumps = [
@@ -178,7 +97,7 @@ class Hints:
         ]
         far = (self.distance / 4).unsqueeze(1).expand_as(bumps[0])
         place = (index / (planes - 1)).expand_as(bumps[0])
-        return torch.stack([*bumps, far, place], 1)
+        return torch.stack([*bumps, far, place], -1)
 
 
 def interpolate_points(
@@ -190,6 +109,7 @@ def interpolate_points(
     """
     h, w = size[0] // factor, size[1] // factor
     grid = pixel_grid(h, w, like).reshape(-1, 2) * factor
+    unit = max(size) / 160
     nearest, smooth, distance = [], [], []
     for points in sparse:
         pick = torch.linspace(0, len(points) - 1, min(len(points), 1500)).round().long()
@@ -200,7 +120,7 @@ def interpolate_points(
         )
         k = min(6, len(pick))
         parts = [torch.cdist(block, xy).topk(k, largest=False) for block in grid.split(8192)]
-        d, index = torch.cat([p[0] for p in parts]), torch.cat([p[1] for p in parts])
+        d, index = torch.cat([p[0] for p in parts]) / unit, torch.cat([p[1] for p in parts])
         weight = 1 / (1 + d**2) / sigma[index].clamp_min(1e-3)
         nearest.append(inv[index[:, 0]])
         smooth.append((weight * inv[index]).sum(1) / weight.sum(1))

@@ -10,7 +10,8 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
-from tco.backbones.sweep import Sweep, SweepConfig
+from tco.backbones.decoder import SweepConfig
+from tco.backbones.sweep import Sweep
 
 EMBEDDED = Path(__file__).parent / "data" / "sweep.safetensors"
 

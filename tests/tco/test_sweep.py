@@ -12,8 +12,11 @@ from torch import Tensor
 
 from tco.backbones import sweep
 from tco.backbones.base import Backbone
-from tco.backbones.sweep import Encoded, Sweep, SweepConfig, convex_upsample, soft_argmax
-from tco.backbones.sweeping import interpolate_points
+from tco.backbones.decoder import SweepConfig, convex_upsample, soft_argmax
+from tco.backbones.sweep import Encoded, Stage, Sweep, expected_confidence
+from tco.backbones.layers import normalised
+from tco.backbones.sweeping import interpolate_points, relative_cameras
+from tco.backbones.warp import correlate
 from tco.backbones.weights import EMBEDDED, load_sweep
 from tco.geometry import rigid, so3_exp
 from tco.lora import LoRAConfig, adapted
@@ -198,7 +201,8 @@ def test_brightness_and_contrast_of_a_view_do_not_matter(
     bias = torch.tensor([0.0, 0.1, 0.05, 0.0, 0.2]).view(-1, 1, 1, 1)
     changed = replace(views, images=gain * views.images + bias)
     maps = [network.features(v.images, v.valid) for v in (views, changed)]
-    for ours, theirs in zip(*maps, strict=True):
+    flat = [(coarse, fine, *context) for coarse, fine, context in maps]
+    for ours, theirs in zip(*flat, strict=True):
         assert (ours - theirs).abs().mean() < 0.02 * ours.std()
     got = network.decode(network.encode(changed, priors))
     assert_mostly_equal(got.depth, full.depth, 0.01, 0.95)
@@ -217,8 +221,8 @@ def test_pixels_outside_the_mask_do_not_matter(network: Sweep, rendered: Rendere
 def test_batches_of_views_do_not_matter(
     network: Sweep, encoded: Encoded, full: Prediction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for columns in (1, 2 * encoded.volume[0, 0, 0].numel(), 10**9):
-        monkeypatch.setattr(sweep, "BATCH", columns)
+    for cells in (1, 2 * encoded.volume[0, ..., 0].numel(), 10**9):
+        monkeypatch.setattr(sweep, "BATCH", cells)
         assert_mostly_equal(network.decode(encoded).depth, full.depth, 1e-3, 0.999)
 
 
@@ -333,11 +337,43 @@ def test_upsampling_picks_and_mixes_the_nine_neighbours() -> None:
 
 def test_confidence_is_a_known_function_of_the_expected_error() -> None:
     """A relative error of 2 % has confidence 2, as its unit says; half the error has 3."""
-    stage = sweep.Stage(torch.full((1, 1, 2), 0.5), torch.tensor([[[0.02, 0.01]]]).log())
-    cameras = Cameras(torch.eye(4)[None], torch.eye(3)[None])
-    got = sweep._prediction(stage, cameras, (0,))
-    torch.testing.assert_close(got.confidence, torch.tensor([[[2.0, 3.0]]]))
-    torch.testing.assert_close(got.depth, torch.full((1, 1, 2), 2.0))
+    log_error = torch.tensor([0.02, 0.01]).log()
+    torch.testing.assert_close(expected_confidence(log_error), torch.tensor([2.0, 3.0]))
+
+
+def test_local_normalisation_shows_faint_texture_and_leaves_flat_regions_dark() -> None:
+    """Stripes of 1/255 on a wall beside a strong edge are as visible as those of 10/255, not so in colour."""
+    x = torch.arange(64)
+    stripes = 0.5 + torch.where(x % 4 < 2, 1.0, -1.0) / 2
+    image = torch.full((1, 3, 64, 64), 0.5)
+    image[..., :16, :] += 0.4
+    image[..., 24:40, :] += 1 / 255 * stripes
+    image[..., 44:60, :] += 10 / 255 * stripes
+    got = normalised(image, torch.ones(1, 64, 64, dtype=torch.bool))
+    assert got.shape == (1, 5, 64, 64)
+    faint, strong = (got[0, :, rows, 8:-8].std((1, 2)) for rows in (slice(30, 34), slice(50, 54)))
+    assert faint[0] < 0.2 * strong[0]
+    assert faint[3] > 0.2 * strong[3]
+    assert faint[4] < faint[3]
+
+
+def test_sources_are_fused_by_a_softmax_over_those_that_see() -> None:
+    views, priors = noise_scene(4)
+    network = tiny()
+    encoded = network.encode(views, priors)
+    assert priors.cameras is not None
+    coarse = network.features(views.images, views.valid)[0]
+    relative = relative_cameras(priors.cameras, [1], encoded.sources[1:2], 4)
+    planes = (encoded.lo[1] + encoded.step[1] * torch.arange(16)).view(1, -1, 1, 1)
+    values, seen = [], []
+    for s, source in enumerate(encoded.sources[1].tolist()):
+        corr, mask = correlate(coarse, torch.tensor([[1, source]]), relative[:, s], planes, 4)
+        values.append(network.fuse(torch.cat([corr, mask[..., None], corr.mean(-1, keepdim=True)], -1)))
+        seen.append(mask[..., None])
+    scores = torch.stack([v[..., -1:] for v in values]).masked_fill(torch.stack(seen) == 0, -torch.inf)
+    expected = (scores.softmax(0).nan_to_num() * torch.stack([v[..., :-1] for v in values])).sum(0)
+    assert 0.05 < torch.stack(seen).mean() < 0.95
+    torch.testing.assert_close(encoded.volume[1:2], expected, rtol=0.05, atol=0.02)
 
 
 def test_the_embedded_weights_are_there_and_small() -> None:

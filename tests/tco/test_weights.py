@@ -12,7 +12,8 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from tco.backbones.sweep import Sweep, SweepConfig
+from tco.backbones.decoder import SweepConfig
+from tco.backbones.sweep import Sweep
 from tco.backbones.weights import EMBEDDED, WeightsError, fill, load_sweep, read_file
 
 TINY = SweepConfig(

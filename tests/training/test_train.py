@@ -11,11 +11,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from tco.backbones.sweep import Encoded, Stage, Sweep, SweepConfig
+from tco.backbones.decoder import SweepConfig
+from tco.backbones.sweep import Encoded, Stage, Sweep
 from tco.backbones.weights import load_sweep
 from training import train
 from training.dataset import load, write
-from training.train import TrainConfig, Trainer, coarse_loss, fine_loss, losses, pooled
+from training.train import TrainConfig, Trainer, coarse_loss, fine_loss, losses, pooled, slope_loss
 
 TINY = SweepConfig(
     planes=16, groups=(4, 2), coarse=16, fine=8, context=8, volume=6, tokens=32, heads=2, blocks=1, hidden=16
@@ -55,7 +56,7 @@ def test_pooled_depth_is_a_mean_on_surfaces_and_one_pixel_at_edges() -> None:
 
 def planes_stage(scores: Tensor, inverse: Tensor) -> tuple[Stage, Encoded]:
     zero = torch.zeros(1)
-    encoded = Encoded(zero, zero, zero, zero, torch.tensor([0.2]), torch.tensor([0.1]), zero, None, None)  # type: ignore[arg-type]
+    encoded = Encoded(zero, zero, (), torch.tensor([0.2]), torch.tensor([0.1]), zero, None, None)  # type: ignore[arg-type]
     return Stage(inverse, torch.zeros_like(inverse), scores), encoded
 
 
@@ -74,20 +75,38 @@ def test_the_coarse_loss_is_the_cross_entropy_between_the_two_nearest_planes() -
     assert float(coarse_loss(flat, encoded, truth)) == pytest.approx(math.log(6), abs=1e-4)
 
 
-@pytest.mark.parametrize("unknown", [0.0, 0.1, 5.0])
-def test_pixels_without_truth_or_out_of_range_do_not_count(unknown: float) -> None:
-    truth = torch.tensor([[[0.4, unknown]]])
+def test_pixels_without_truth_do_not_count() -> None:
+    truth = torch.tensor([[[0.4, 0.0]]])
     scores = torch.randn(1, 6, 1, 2, generator=torch.Generator().manual_seed(0))
     stage, encoded = planes_stage(scores, torch.tensor([[[0.41, 0.3]]]))
     alone, _ = planes_stage(scores[..., :1], torch.tensor([[[0.41]]]))
     torch.testing.assert_close(
         coarse_loss(stage, encoded, truth), coarse_loss(alone, encoded, truth[..., :1])
     )
-    if not unknown:
-        both = [
-            fine_loss(Stage(s.inverse, s.log_error), t) for s, t in ((stage, truth), (alone, truth[..., :1]))
-        ]
-        torch.testing.assert_close(both[0], both[1])
+    both = [fine_loss(Stage(s.inverse, s.log_error), t) for s, t in ((stage, truth), (alone, truth[..., :1]))]
+    torch.testing.assert_close(both[0], both[1])
+
+
+@pytest.mark.parametrize(("truth", "end"), [(0.05, 0), (5.0, 5)])
+def test_what_lies_outside_the_sweep_belongs_to_its_end(truth: float, end: int) -> None:
+    sure = torch.full((1, 6, 1, 1), -30.0)
+    sure[0, end] = 0.0
+    stage, encoded = planes_stage(sure, torch.tensor([[[0.2 + 0.1 * end]]]))
+    assert float(coarse_loss(stage, encoded, torch.full((1, 1, 1), truth))) < 0.05
+    wrong, _ = planes_stage(sure.flip(1), torch.tensor([[[0.2 + 0.1 * end]]]))
+    assert float(coarse_loss(wrong, encoded, torch.full((1, 1, 1), truth))) > 20
+
+
+def test_a_common_offset_has_no_slope_and_a_tilt_has_its_own() -> None:
+    truth = 0.3 + 0.2 * torch.rand(1, 12, 16, generator=torch.Generator().manual_seed(2))
+    zero = torch.zeros_like(truth)
+    assert float(slope_loss(Stage(truth * 1.03, zero), truth)) == pytest.approx(0, abs=1e-5)
+    tilted = truth * torch.exp(0.01 * torch.arange(16.0))
+    assert float(slope_loss(Stage(tilted, zero), truth)) == pytest.approx(0.01 + 0.02 + 0.04, rel=1e-3)
+    holes = truth.clone()
+    holes[:, ::2] = 0
+    holes[:, :, ::2] = 0  # no two neighbours at spacing 1; those at 2 and 4 remain
+    assert float(slope_loss(Stage(tilted, zero), holes)) == pytest.approx(0.02 + 0.04, rel=1e-3)
 
 
 def test_the_fine_loss_is_lowest_where_the_expected_error_is_the_true_one() -> None:
@@ -126,8 +145,8 @@ def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
 @pytest.mark.usefixtures("_small")
 def test_training_resumes_where_it_stopped(data: Path, tmp_path: Path) -> None:
     """Four steps at once, and two, a restart, and two: the same weights to the last bit."""
-    whole = Trainer(CONFIG, data, tmp_path / "whole")
-    first = Trainer(CONFIG, data, tmp_path / "parts")
+    whole = Trainer(CONFIG, [data], tmp_path / "whole")
+    first = Trainer(CONFIG, [data], tmp_path / "parts")
     assert same(whole.net.state_dict(), first.net.state_dict())
     for trainer, steps in ((whole, 4), (first, 2)):
         for _ in range(steps):
@@ -136,7 +155,7 @@ def test_training_resumes_where_it_stopped(data: Path, tmp_path: Path) -> None:
     assert not same(whole.net.state_dict(), first.net.state_dict())
     first.save()
 
-    second = Trainer(CONFIG, data, tmp_path / "parts")
+    second = Trainer(CONFIG, [data], tmp_path / "parts")
     assert second.step == 2
     assert same(second.net.state_dict(), first.net.state_dict())
     assert same(second.mean.state_dict(), first.mean.state_dict())
@@ -150,7 +169,7 @@ def test_training_resumes_where_it_stopped(data: Path, tmp_path: Path) -> None:
 @pytest.mark.usefixtures("_small")
 def test_the_average_follows_closely_at_first_and_slowly_later(data: Path, tmp_path: Path) -> None:
     """mean ← d · mean + (1 − d) · weights, with d = (step + 1) / (step + 10) up to ``average``."""
-    trainer = Trainer(replace(CONFIG, average=0.6), data, tmp_path)
+    trainer = Trainer(replace(CONFIG, average=0.6), [data], tmp_path)
     for step, decay in ((0, 0.1), (4, 5 / 14), (30, 0.6)):
         trainer.step = step
         before = {k: v.clone() for k, v in trainer.mean.state_dict().items()}
@@ -162,7 +181,7 @@ def test_the_average_follows_closely_at_first_and_slowly_later(data: Path, tmp_p
 
 @pytest.mark.usefixtures("_small")
 def test_a_run_ends_with_weights_that_the_package_loads(data: Path, tmp_path: Path) -> None:
-    trainer = Trainer(replace(CONFIG, steps=4), data, tmp_path)
+    trainer = Trainer(replace(CONFIG, steps=4), [data], tmp_path)
     trainer.run(every=2, validation=4)
     loaded = load_sweep(tmp_path / "weights.safetensors")
     assert loaded.config == TINY
@@ -175,7 +194,7 @@ def test_a_run_ends_with_weights_that_the_package_loads(data: Path, tmp_path: Pa
 
 @pytest.mark.usefixtures("_small")
 def test_the_rate_warms_up_and_falls_to_a_fiftieth(data: Path, tmp_path: Path) -> None:
-    trainer = Trainer(TrainConfig(steps=100, rate=2.0, warmup=10), data, tmp_path)
+    trainer = Trainer(TrainConfig(steps=100, rate=2.0, warmup=10), [data], tmp_path)
     rates = []
     for trainer.step in range(101):
         rates.append(trainer.rate())
@@ -187,7 +206,7 @@ def test_the_rate_warms_up_and_falls_to_a_fiftieth(data: Path, tmp_path: Path) -
 
 @pytest.mark.usefixtures("_small")
 def test_validation_is_of_the_held_out_samples_alone(data: Path, tmp_path: Path) -> None:
-    trainer = Trainer(CONFIG, data, tmp_path)
+    trainer = Trainer(CONFIG, [data], tmp_path)
     sample = load(data / "000000.npz", 7, (96, 128))
     assert sample is not None
     with torch.no_grad():
