@@ -82,6 +82,7 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Command] = CO
     6 partly done, 130 interrupted.
     """
     words = flags.normalise(sys.argv[1:] if argv is None else argv)
+    idle_threads_sleep()
     outcome = _Outcome()
     with outcome:
         options, _ = _global_options().parse_known_args(words)
@@ -95,6 +96,17 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Command] = CO
         if result is not None:
             print(result.summary(), flush=True)
     return outcome.exit_code
+
+
+def idle_threads_sleep() -> None:
+    """Let OpenMP's threads sleep, not spin, while they wait for work, unless the user has said otherwise.
+
+    GNU's runtime lets a waiting thread spin for milliseconds. Where other programs want the cores too, each
+    short parallel loop then waits for a thread that the system has stopped, and a run can take ten times as
+    long. It reads the variable when torch loads it, so this must come before.
+    """
+    if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & os.environ.keys():
+        os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
 
 
 def exit_code(error: BaseException) -> int:
