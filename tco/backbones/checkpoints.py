@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import pickle
-import types
 import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -103,8 +102,10 @@ def _read_torch(path: Path) -> dict[str, Tensor]:
             f"{path}: not a complete file of torch.save ({reason}); fetch or copy it again"
         ) from error
     if not isinstance(content, dict) or not all(isinstance(t, Tensor) for t in content.values()):
-        inside = ", ".join(map(str, list(content)[:4])) if isinstance(content, dict) else type(content).__name__
-        raise WeightsError(f"{path}: expected a plain table of tensors by name, found {inside or 'nothing'}")
+        inside = type(content).__name__
+        if isinstance(content, dict):
+            inside = "entries " + ", ".join(map(str, list(content)[:4]))
+        raise WeightsError(f"{path}: expected a plain table of tensors by name, found {inside}")
     return content
 
 
@@ -144,8 +145,8 @@ def _sizes(text: str, kind: type[_Config], path: Path) -> _Config:
 
 
 def _from_table(table: Mapping[str, Any], kind: Any) -> Any:
-    """A dataclass, with dataclasses and tuples in it, from what ``dataclasses.asdict`` and JSON made of it."""
-    hints = typing.get_type_hints(kind, localns=vars(types))
+    """A dataclass, with dataclasses and tuples in it, from what ``asdict`` and JSON made of it."""
+    hints = typing.get_type_hints(kind)
     values = {}
     for name, value in dict(table).items():
         if dataclasses.is_dataclass(hints.get(name)):

@@ -123,13 +123,13 @@ class DINOv2(nn.Module):
         places = self.pos_embed[:, 1:]
         if grid == (self.side, self.side):
             return places
-        square = places.unflatten(1, (self.side, self.side)).permute(0, 3, 1, 2).float()
+        square = places.unflatten(1, (self.side, self.side)).permute(0, 3, 1, 2)
         resized = F.interpolate(square, grid, mode="bicubic", antialias=True)
         return resized.flatten(2).transpose(1, 2)
 
     def forward(self, images: Tensor, grid: tuple[int, int]) -> Tensor:
         """Normalised images (V, 3, H, W) → patch tokens (V, rows · columns, C)."""
-        patches = self.patch_embed(images).float() + self.positions(grid)
+        patches = self.patch_embed(images).to(images.dtype) + self.positions(grid)
         first = self.cls_token + self.pos_embed[:, :1]
         special = torch.cat([first, self.register_tokens], 1).expand(len(images), -1, -1)
         x = torch.cat([special, patches], 1)

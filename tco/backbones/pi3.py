@@ -20,7 +20,14 @@ from torch import Tensor, nn
 from tco.backbones.checkpoints import load_network
 from tco.backbones.dinov2 import COLOR_MEAN, COLOR_STD, PATCH, DINOv2, Patches, ViTConfig, patch_grid
 from tco.backbones.pi3_heads import PixelHead, PoseHead, ViewDecoder, recovered_focal
-from tco.backbones.transformer import Block, Rotary, compute_dtype, computing, rotary, run_block, store_products
+from tco.backbones.transformer import (
+    Block,
+    compute_dtype,
+    computing,
+    rotary,
+    run_block,
+    store_products,
+)
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
 
 
@@ -127,7 +134,7 @@ class Pi3(nn.Module):
         n = self.network
         with computing(views.images.device, self.dtype):
             tokens = n.encoder((views.images - n.image_mean) / n.image_std, grid)
-        return Patches(tokens.float(), grid, views.valid)
+        return Patches(tokens, grid, views.valid)
 
     def with_points(self, encoded: Patches, points: Mapping[int, SparseDepth]) -> Patches:
         """The same features: this network takes no points."""
@@ -198,7 +205,10 @@ def centred(focal: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def load(
-    path: Path, device: torch.device | str = "cpu", dtype: torch.dtype | None = None, recompute: range = range(0)
+    path: Path,
+    device: torch.device | str = "cpu",
+    dtype: torch.dtype | None = None,
+    recompute: range = range(0),
 ) -> Pi3:
     """π³ with the weights of a file, frozen and in evaluation mode.
 

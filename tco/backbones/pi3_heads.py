@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -30,11 +28,11 @@ class ViewDecoder(nn.Module):
         self.linear_out = nn.Linear(hidden, out)
 
     def forward(self, tokens: Tensor, turn: Rotary) -> Tensor:
-        """(V, N, channels) → (V, N, out), float32."""
-        x = self.projects(tokens).float()
+        """(V, N, channels) → (V, N, out), of the same dtype."""
+        x = self.projects(tokens).to(tokens.dtype)
         for block in self.blocks:
             x = block(x, turn)
-        return self.linear_out(x).float()
+        return self.linear_out(x).to(tokens.dtype)
 
 
 class PixelHead(nn.Module):
@@ -103,7 +101,7 @@ class _NearestRotation(torch.autograd.Function):
         """With Ω = Uᵀ dM V, dR = U [(Ω − Ωᵀ)ᵢⱼ / (sᵢ + sⱼ)] Vᵀ."""
         U, S, Vt = ctx.saved_tensors  # type: ignore[attr-defined]
         total = S.unsqueeze(-1) + S.unsqueeze(-2)
-        # sᵢ + sⱼ is zero where several rotations are equally near: no direction is right there, none is taken.
+        # sᵢ + sⱼ is zero where several rotations are equally near: no direction is right, none is taken.
         factor = torch.where(total.abs() > 1e-6, 1 / total, torch.zeros_like(total))
         G = factor * (U.transpose(-1, -2) @ gradients[0] @ Vt.transpose(-1, -2))
         return U @ (G - G.transpose(-1, -2)) @ Vt
@@ -136,8 +134,3 @@ def recovered_focal(ray: Tensor, weight: Tensor) -> Tensor:
     spread = (weight * (u * u).sum(-1)).sum((1, 2)).clamp_min(torch.finfo(ray.dtype).tiny)
     inverse = (weight * (u * ray).sum(-1)).sum((1, 2)) / spread
     return unit / inverse.clamp(1 / FOCAL[1], 1 / FOCAL[0])
-
-
-def in_batches(work: Callable[[Tensor], Tensor], views: Tensor, size: int) -> Tensor:
-    """``work`` on ``size`` views of (V, …) at a time, for the sake of memory."""
-    return torch.cat([work(part) for part in views.split(size)])

@@ -20,7 +20,15 @@ from torch import Tensor, nn
 
 from tco.backbones.checkpoints import load_network
 from tco.backbones.dinov2 import PATCH, DINOv2, Patches, ViTConfig, normalized, patch_grid
-from tco.backbones.transformer import Block, Rotary, compute_dtype, computing, rotary, run_block, store_products
+from tco.backbones.transformer import (
+    Block,
+    Rotary,
+    compute_dtype,
+    computing,
+    rotary,
+    run_block,
+    store_products,
+)
 from tco.backbones.vggt_heads import CameraHead, DPTHead, cameras, depth_of, points_of
 from tco.types import Prediction, Priors, SparseDepth, Views
 
@@ -177,7 +185,7 @@ class VGGT(nn.Module):
         grid = patch_grid(views)
         with computing(views.images.device, self.dtype):
             tokens = self.network.aggregator.patch_embed(normalized(views.images), grid)
-        return Patches(tokens.float(), grid, views.valid)
+        return Patches(tokens, grid, views.valid)
 
     def with_points(self, encoded: Patches, points: Mapping[int, SparseDepth]) -> Patches:
         """The same features: this network takes no points."""
@@ -207,7 +215,10 @@ class VGGT(nn.Module):
 
 
 def load(
-    path: Path, device: torch.device | str = "cpu", dtype: torch.dtype | None = None, recompute: range = range(0)
+    path: Path,
+    device: torch.device | str = "cpu",
+    dtype: torch.dtype | None = None,
+    recompute: range = range(0),
 ) -> VGGT:
     """VGGT with the weights of a file, frozen and in evaluation mode.
 
