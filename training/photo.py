@@ -17,10 +17,13 @@ def _toned(x: Floats, rng: Rng) -> Floats:
     v, h, w = x.shape[:3]
     drift, kind = rng.choice([0.0, 0.04, 0.15]), rng.random()
     low, high = (0.2, 0.6) if kind < 0.2 else (1.15, 2.0) if kind < 0.35 else (0.5, 1.15)
-    most = max(0.6, 1 / (float(np.quantile(x.mean(-1), 0.65)) + 1e-3))  # two thirds do not clip
-    gain = min(most, rng.uniform(low, high)) * np.exp(
-        rng.normal(0, drift, (v, 1, 1, 1)) + rng.normal(0, 0.06 + 0.3 * drift, (v, 1, 1, 3))
+    most = 1 / (
+        np.quantile(x.mean(-1), 0.6, (1, 2)).reshape(v, 1, 1, 1) + 1e-3
+    )  # more than half does not clip
+    gain = np.minimum(
+        rng.uniform(low, high) * np.exp(rng.normal(0, drift, (v, 1, 1, 1))), np.maximum(0.6, most)
     )
+    gain = gain * np.exp(rng.normal(0, 0.06 + 0.3 * drift, (v, 1, 1, 3)))
     grey = x.mean(-1, keepdims=True)
     x = grey + rng.uniform(0.15, 1.05) * (x - grey)
     yy, xx = np.meshgrid(np.linspace(-1, 1, h), np.linspace(-1, 1, w), indexing="ij")
