@@ -62,6 +62,9 @@ class Pi3Config:
 class Pi3Network(nn.Module):
     """The published network; names and shapes of the state dict are the published."""
 
+    image_mean: Tensor
+    image_std: Tensor
+
     def __init__(self, config: Pi3Config) -> None:
         super().__init__()
         self.config = c = config

@@ -158,11 +158,10 @@ class Scratch(nn.Module):
         """Levels (V, ·, h, w), the finest first → features (V, C, 2 h, 2 w) of twice the finest."""
         finest = levels[0].shape[-2:]
         sizes = [(2 * finest[0], 2 * finest[1]), *(tuple(x.shape[-2:]) for x in levels[:-1])]
-        x, skip = None, None
-        for i in range(len(levels), 0, -1):
-            skip = self.get_submodule(f"layer{i}_rn")(levels[i - 1])
-            fusion = self.get_submodule(f"refinenet{i}")
-            x = fusion(skip, None, sizes[i - 1]) if x is None else fusion(x, skip, sizes[i - 1])
+        same = [self.get_submodule(f"layer{i}_rn")(x) for i, x in enumerate(levels, 1)]
+        x = self.get_submodule(f"refinenet{len(levels)}")(same[-1], None, sizes[-1])
+        for i in range(len(levels) - 1, 0, -1):
+            x = self.get_submodule(f"refinenet{i}")(x, same[i - 1], sizes[i - 1])
         return x
 
 
