@@ -26,6 +26,32 @@ logger = logging.getLogger(__name__)
 INTERRUPTED = 130
 
 
+class Argument(NamedTuple):
+    """A word of a command line that belongs to no flag.
+
+    Attributes:
+        name: for the usage line.
+        help: what it is.
+        kind: what it becomes, ``Path`` or ``str``.
+        choices: the words allowed, or None.
+        optional: whether it may be missing; it is None then.
+    """
+
+    name: str
+    help: str
+    kind: type = Path
+    choices: tuple[str, ...] | None = None
+    optional: bool = False
+
+    @property
+    def shown(self) -> str:
+        """The name as the usage line has it."""
+        return f"[{self.name.upper()}]" if self.optional else self.name.upper()
+
+
+WORKSPACE = Argument("workspace", "folder with images/ and, unless it is to be made, a COLMAP model")
+
+
 class Command(NamedTuple):
     """A subcommand, with everything but its help text imported only when it is called.
 
@@ -33,19 +59,15 @@ class Command(NamedTuple):
         help: one line for the list of commands.
         config: ``module:Dataclass``, which the flags are generated from. The module must not import
             torch, numpy or pycolmap at its top, so that ``--help`` stays fast.
-        function: ``module:function``, called as ``function(path, config, progress)``, or
-            ``function(config, progress)`` where there is no argument. It returns a :class:`Summary`
-            or None.
-        argument: name and help of the positional path, or None.
+        function: ``module:function``, called as ``function(*arguments, config, progress)``. It returns a
+            :class:`Summary` or None.
+        arguments: the words that belong to no flag, in order.
     """
 
     help: str
     config: str
     function: str
-    argument: tuple[str, str] | None = (
-        "workspace",
-        "folder with images/ and, unless it is to be made, a COLMAP model",
-    )
+    arguments: tuple[Argument, ...] = (WORKSPACE,)
 
 
 class Summary(Protocol):
@@ -61,6 +83,15 @@ COMMANDS: dict[str, Command] = {
         "make depth maps and a fused cloud of a COLMAP workspace",
         "colmap_tco.densify:DensifyConfig",
         "colmap_tco.densify:densify",
+    ),
+    "weights": Command(
+        "list, fetch, find and verify the weights of published networks",
+        "colmap_tco.weights:WeightsConfig",
+        "colmap_tco.weights:weights",
+        (
+            Argument("action", "what to do", str, ("list", "fetch", "path", "verify")),
+            Argument("network", "whose weights, as the list names it", str, optional=True),
+        ),
     ),
 }
 
@@ -82,19 +113,31 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Command] = CO
     6 partly done, 130 interrupted.
     """
     words = flags.normalise(sys.argv[1:] if argv is None else argv)
+    idle_threads_sleep()
     outcome = _Outcome()
     with outcome:
         options, _ = _global_options().parse_known_args(words)
         outcome.show_traceback = options.verbose > 0
         configure_logging(options.verbose - options.quiet, options.log_json)
-        name, path, config = _parse(words, commands)
+        name, given, config = _parse(words, commands)
         draw = _on_terminal() and not options.log_json and not options.quiet
         with _sigterm_interrupts(), Progress(bar=draw) as progress, _logging_beside_bar(draw):
             function = _load(commands[name].function)
-            result = function(config, progress) if path is None else function(path, config, progress)
+            result = function(*given, config, progress)
         if result is not None:
             print(result.summary(), flush=True)
     return outcome.exit_code
+
+
+def idle_threads_sleep() -> None:
+    """Let OpenMP's threads sleep, not spin, while they wait for work, unless the user has said otherwise.
+
+    GNU's runtime lets a waiting thread spin for milliseconds. Where other programs want the cores too, each
+    short parallel loop then waits for a thread that the system has stopped, and a run can take ten times as
+    long. It reads the variable when torch loads it, so this must come before.
+    """
+    if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & os.environ.keys():
+        os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
 
 
 def exit_code(error: BaseException) -> int:
@@ -240,8 +283,8 @@ def _global_options() -> _Parser:
     return parser
 
 
-def _parse(words: list[str], commands: Mapping[str, Command]) -> tuple[str, Path | None, Any]:
-    """(command, path, configuration) of a command line.
+def _parse(words: list[str], commands: Mapping[str, Command]) -> tuple[str, list[Any], Any]:
+    """(command, arguments, configuration) of a command line.
 
     Only the command that is named gets its flags, so that only its configuration is imported.
 
@@ -270,24 +313,31 @@ def _parse(words: list[str], commands: Mapping[str, Command]) -> tuple[str, Path
     namespace, unknown = parser.parse_known_args(words)
     if unknown:
         raise UsageError(_unknown_message(unknown[0], known))
-    return namespace.command, getattr(namespace, _PATH, None), _build(config_type, namespace)
+    given = [getattr(namespace, _STORED + a.name) for a in commands[namespace.command].arguments]
+    return namespace.command, given, _build(config_type, namespace)
 
 
 def _add_command(subparsers: Any, name: str, command: Command, common: _Parser) -> _Parser:
     """The parser of one command, without the flags of its configuration."""
-    usage = f"%(prog)s {command.argument[0].upper()} [flags]" if command.argument else "%(prog)s [flags]"
+    usage = " ".join(["%(prog)s", *(argument.shown for argument in command.arguments), "[flags]"])
     description = command.help[:1].upper() + command.help[1:] + "."
     sub: _Parser = subparsers.add_parser(
         name, help=command.help, description=description, usage=usage, parents=[common]
     )
-    if command.argument:
-        argument, text = command.argument
-        sub.add_argument(_PATH, metavar=argument.upper(), type=Path, help=text)
+    for argument in command.arguments:
+        sub.add_argument(
+            _STORED + argument.name,
+            metavar="{" + ",".join(argument.choices) + "}" if argument.choices else argument.name.upper(),
+            type=argument.kind,
+            choices=argument.choices,
+            nargs="?" if argument.optional else None,
+            help=argument.help,
+        )
     return sub
 
 
-_PATH = "positional path"
-"""Where the positional argument is stored; the blank keeps it apart from the names of settings."""
+_STORED = "positional "
+"""Begins the names under which arguments are stored; the blank keeps them apart from those of settings."""
 
 
 def _build(config_type: type | None, namespace: argparse.Namespace) -> Any:

@@ -23,6 +23,7 @@ from colmap_tco import _pycolmap, outputs
 from colmap_tco.chunks import ChunkPlan, plan_chunks, source_views
 from colmap_tco.errors import InputError, PartlyDoneError
 from colmap_tco.fusion import FusionConfig, fuse
+from colmap_tco.lock import locked
 from colmap_tco.mapping import MappingConfig, ensure_model
 from colmap_tco.predict import (
     NetworkConfig,
@@ -37,7 +38,7 @@ from colmap_tco.progress import Progress
 from colmap_tco.resume import Result, fingerprint, open_result
 from colmap_tco.tracks import Covisibility, Tracks, covisibility, read_tracks
 from colmap_tco.views import View, ViewConfig, make_views
-from colmap_tco.workspace import Workspace, WorkspaceConfig, open_workspace
+from colmap_tco.workspace import Workspace, WorkspaceConfig, existing_root, open_workspace
 from tco.config import knob
 from tco.options import TCOConfig
 
@@ -86,7 +87,7 @@ class Densified:
                 f"(median error {100 * held['median_error']:.2f} %)"
             )
         return (
-            f"{self.folder / 'fused.ply'}: {r['points']} points from {len(r['views'])} views, {state}\n"
+            f"{self.folder / 'fused.ply'}: {r['points']} points from {r['images']['used']} views, {state}\n"
             f"{quality}; {sum(r['seconds'].values()):.0f} s; details in {self.folder / 'report.json'}"
         )
 
@@ -97,10 +98,23 @@ def densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified:
     Nothing that the user had is changed; an interrupted run is continued by the next.
 
     Raises:
-        InputError: images, model or masks that cannot be used, or a result with other settings is there.
+        InputError: images, model or masks that cannot be used, a result with other settings is there, or
+            another run is working on the workspace.
         MissingError: no such device or weights.
-        PartlyDoneError: everything was written, but some views had to be left out.
+        PartlyDoneError: everything was written, but some views had to be left out; also where an earlier
+            run with these settings did so.
     """
+    root = existing_root(root)
+    with locked(root):
+        done = _densify(root, config, progress)
+    left = done.report["images"]["skipped"]
+    if left:
+        raise PartlyDoneError(f"{done.summary()}\n{left} images were left out; report.json says why of each")
+    return done
+
+
+def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified:
+    """The whole way, with the workspace locked."""
     clock = _Clock()
     progress.plan(STAGES)
     with clock("workspace"):
@@ -112,26 +126,24 @@ def densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified:
         views, blind = with_points(tracks, views, config.priors, config.seed)
         pairs = covisibility(tracks, [view.image_id for view in views])
         plan = plan_chunks(pairs.common, chunk_limit(views, config.network, free_memory()))
-        result = open_result(root, _fingerprint(workspace, views, config), config.overwrite)
+        key, maps = _fingerprints(workspace, views, config)
+        result = open_result(root, key, config.overwrite, maps)
     if result.finished:
         return Densified(result.paths.root, json.loads(result.paths.report.read_text("utf-8")), fresh=False)
-    skipped = {
-        **workspace.skipped,
-        **skipped,
-        **blind,
-        **{views[i].name: why for i, why in plan.skipped.items()},
-    }
+    alone = {views[i].name: why for i, why in plan.skipped.items()}
+    skipped = {**workspace.skipped, **skipped, **blind, **alone}
     with clock("optimisation"), _threads(config.num_threads):
-        history = _predict(result, tracks, views, plan, config, (backbone, device), progress)
+        _predict(result, tracks, views, plan, config, (backbone, device), progress)
     used = _used(result, views, config.refine_cameras)
     if not used:
         raise InputError(f"no view could be used: {outputs.plain(skipped)}")
     with clock("fusion"):
         report = _fuse_and_write(result, workspace, used, pairs, views, config, progress)
     report |= {
-        "views": _view_table(result, used, skipped),
+        "views": _view_table(result, used, skipped, workspace.unregistered),
+        "images": {"used": len(used), "skipped": len(skipped), "unregistered": len(workspace.unregistered)},
         "held_out": _held_out(result),
-        "loss": history,
+        "loss": [chunk["loss"] for chunk in result.chunks],
         "workspace": {"model": workspace.model_path, "reasons": workspace.reasons},
         "settings": config,
         "versions": _versions(),
@@ -140,12 +152,7 @@ def densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified:
     }
     outputs.write_report(result.paths.report, report)
     folder = result.publish().root
-    done = Densified(folder, json.loads((folder / "report.json").read_text("utf-8")), fresh=True)
-    if skipped:
-        raise PartlyDoneError(
-            f"{done.summary()}\n{len(skipped)} images were left out; report.json says why of each"
-        )
-    return done
+    return Densified(folder, json.loads((folder / "report.json").read_text("utf-8")), fresh=True)
 
 
 STAGES = {"workspace": 2.0, "optimisation": 80.0, "fusion": 18.0}
@@ -186,32 +193,36 @@ def _open_or_map(root: Path, config: DensifyConfig) -> Workspace:
     return open_workspace(root, config.workspace, config.num_threads)
 
 
-def _fingerprint(workspace: Workspace, views: Sequence[View], config: DensifyConfig) -> str:
-    """Changes with everything that decides the result."""
+def _fingerprints(workspace: Workspace, views: Sequence[View], config: DensifyConfig) -> tuple[str, str]:
+    """Two texts: one changes with everything that decides the result, one with what decides the maps."""
     kept = dataclasses.replace(
         config, overwrite=False, fusion=dataclasses.replace(config.fusion, num_threads=-1)
     )
-    settings = {"settings": outputs.plain(kept), "versions": _versions()}
+    mapped = dataclasses.replace(kept, refine_cameras=False, fusion=FusionConfig())
     masks = [view.mask_path for view in views if view.mask_path is not None]
     model = [path for path in workspace.model_path.iterdir() if path.suffix in (".bin", ".txt")]
     contents = [*model, *masks, weights_file(config.network)]
-    return fingerprint(settings, contents, [view.path for view in views])
+    pictures = [view.path for view in views]
+
+    def key(settings: DensifyConfig) -> str:
+        told = {"settings": outputs.plain(settings), "versions": _versions()}
+        return fingerprint(told, contents, pictures)
+
+    return key(kept), key(mapped)
 
 
 def _predict(
     result: Result, tracks: Tracks, views: Sequence[View], plan: ChunkPlan, config: DensifyConfig,
     network: Any, progress: Progress,
-) -> list[list[dict[str, float]]]:  # fmt: skip
+) -> None:  # fmt: skip
     """Optimise the chunks that are not finished yet and write the maps of their views."""
     todo = [c for c in plan.chunks if not all(result.is_done(views[i].name) for i in c.owned)]
     progress.stage("optimisation", sum(config.tco.steps + len(c.owned) for c in todo))
-    history = []
     for chunk in todo:
         settings = (config.priors, config.tco, config.seed)
         done = predict_chunk(
             network, tracks, views, chunk, settings, lambda terms: progress.advance(1, loss=terms["loss"])
         )
-        history.append(done.history)
         for view in (views[i] for i in chunk.owned):
             r = done.views[view.name]
             outputs.write_view(result.paths, view, r.maps)
@@ -224,7 +235,9 @@ def _predict(
             figures: Any = outputs.plain(r.figures)
             result.mark_done(view.name, {**figures, **exact})
             progress.advance(1)
-    return history
+        names = [views[i].name for i in chunk.owned]
+        loss: Any = outputs.plain(done.history)
+        result.mark_chunk({"views": names, "loss": loss})
 
 
 def _used(result: Result, views: Sequence[View], refine: bool) -> list[View]:
@@ -262,10 +275,13 @@ def _fuse_and_write(
     return {"points": len(cloud), "fusion": report.as_dict()}
 
 
-def _view_table(result: Result, used: Sequence[View], skipped: Mapping[str, str]) -> dict[str, Any]:
-    """Every image of the model: used with its figures, or why not."""
+def _view_table(
+    result: Result, used: Sequence[View], skipped: Mapping[str, str], unregistered: Mapping[str, str]
+) -> dict[str, Any]:
+    """Every image: used with its figures, or why not."""
     table: dict[str, Any] = {v.name: {"state": "used", **result.views[v.name]} for v in used}
     table.update({name: {"state": "skipped", "why": why} for name, why in skipped.items()})
+    table.update({name: {"state": "unregistered", "why": why} for name, why in unregistered.items()})
     return dict(sorted(table.items()))
 
 

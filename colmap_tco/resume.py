@@ -16,6 +16,7 @@ import os
 import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 from colmap_tco.atomic import UNFINISHED, write_text
 from colmap_tco.errors import InputError
@@ -44,6 +45,13 @@ def fingerprint(settings: Mapping[str, object], contents: Iterable[Path], files:
     return digest.hexdigest()
 
 
+class _Record(NamedTuple):
+    """What a manifest holds of the work that was done: figures of views by name, and of chunks."""
+
+    views: dict[str, dict[str, object]]
+    chunks: list[dict[str, object]]
+
+
 class Result:
     """The result folder of one workspace, finished or in the making; opened by :func:`open_result`.
 
@@ -51,16 +59,15 @@ class Result:
         paths: where to write, or, if ``finished``, where the result is.
         finished: True if the published result has this fingerprint: nothing is left to do.
         views: what was recorded of each finished view, by name.
+        chunks: what was recorded of each finished chunk, earlier runs included.
     """
 
-    def __init__(
-        self, root: Path, fingerprint: str, finished: bool, views: dict[str, dict[str, object]]
-    ) -> None:
+    def __init__(self, root: Path, keys: tuple[str, str], finished: bool, record: _Record) -> None:
         self.paths: DensePaths = dense_paths(root) if finished else partial_paths(root)
         self.finished = finished
-        self.views = views
+        self.views, self.chunks = record
         self._root = root
-        self._fingerprint = fingerprint
+        self._fingerprint, self._maps = keys
 
     def is_done(self, name: str) -> bool:
         """Whether this view was finished, now or by an earlier run."""
@@ -69,6 +76,11 @@ class Result:
     def mark_done(self, name: str, figures: Mapping[str, object]) -> None:
         """Record that all files of a view are written, with its figures for the report."""
         self.views[name] = dict(figures)
+        self._save(complete=False)
+
+    def mark_chunk(self, figures: Mapping[str, object]) -> None:
+        """Record what is to be reported of a chunk whose views are all done."""
+        self.chunks.append(dict(figures))
         self._save(complete=False)
 
     def publish(self) -> DensePaths:
@@ -93,68 +105,100 @@ class Result:
             "made_by": _MADE_BY,
             "format": _FORMAT,
             "fingerprint": self._fingerprint,
+            "maps": self._maps,
             "complete": complete,
+            "chunks": self.chunks,
             "views": self.views,
         }
         write_text(self.paths.manifest, json.dumps(manifest, indent=1, allow_nan=False) + "\n")
 
 
-def open_result(root: Path, fingerprint: str, overwrite: bool = False) -> Result:
+def open_result(root: Path, fingerprint: str, overwrite: bool = False, maps: str = "") -> Result:
     """Find out what there is to do, and prepare the partial folder for it.
 
     Args:
         root: the workspace.
         fingerprint: of this run's settings and inputs, see :func:`fingerprint`.
-        overwrite: make the result anew even if there is one, and let it replace the one there.
+        overwrite: make the result anew even if there is one, and let it replace the one there. The maps of
+            a result that differs by what comes after them alone are kept.
+        maps: fingerprint of what decides the depth maps; empty: the same as ``fingerprint``.
 
     Raises:
         InputError: a result of other settings is there and ``overwrite`` is not given; or a folder of
             that name is there which we did not make.
     """
     final, partial, aside = dense_paths(root), partial_paths(root), _aside(root)
+    keys = (fingerprint, maps or fingerprint)
+    reusable = False
     if aside.root.exists():
         _restore(final, aside)
     if final.root.exists():
         _require_ours(final)
         same = _read(final).get("fingerprint") == fingerprint
+        reusable = not same and _maps_key(final) == keys[1]
         if same and not overwrite:
             log.info("%s is complete and made with these settings: nothing to do", final.root)
-            return Result(root, fingerprint, True, _views(final))
+            return Result(root, keys, True, _record(final))
         if not overwrite:
+            hint = "replace it (its depth maps will be kept)" if reusable else "replace it"
             raise InputError(
                 f"{final.root} was made from other inputs or with other settings; give --overwrite to "
-                "replace it, or rename it to keep it"
+                f"{hint}, or rename it to keep it"
             )
-    views = _resume(partial, fingerprint)
-    result = Result(root, fingerprint, False, views)
+    record = _resume(partial, keys[1])
+    if reusable and not record.views:
+        record = _reuse(final, partial)
+    result = Result(root, keys, False, record)
     result._save(complete=False)
     return result
 
 
-def _resume(partial: DensePaths, fingerprint: str) -> dict[str, dict[str, object]]:
-    """The finished views in a partial folder of this fingerprint; any other of ours is removed."""
+def _resume(partial: DensePaths, maps: str) -> _Record:
+    """The finished views in a partial folder with this fingerprint of maps; any other of ours is removed."""
     if not partial.root.exists():
-        return {}
+        return _Record({}, [])
     _require_ours(partial)
-    manifest = _read(partial)
-    if manifest.get("fingerprint") != fingerprint:
+    if _maps_key(partial) != maps:
         log.info("%s was begun from other inputs or with other settings: beginning anew", partial.root)
         shutil.rmtree(partial.root)
-        return {}
+        return _Record({}, [])
     for unfinished in list(partial.root.rglob(f"*{UNFINISHED}*")):
         if unfinished.is_dir():
             shutil.rmtree(unfinished)
         else:
             unfinished.unlink()
-    views = {name: figures for name, figures in _views(partial).items() if _all_there(partial, name)}
+    record = _record(partial)
+    views = {name: figures for name, figures in record.views.items() if _all_there(partial, name)}
     log.info("%s: going on after %d finished views", partial.root, len(views))
-    return views
+    return _Record(views, record.chunks)
+
+
+def _reuse(final: DensePaths, partial: DensePaths) -> _Record:
+    """The maps and images of a published result in the partial folder too, as links or copies.
+
+    Files of a result are replaced, never changed, so that a link is as good as a copy.
+    """
+    record = _record(final)
+    views = {name: figures for name, figures in record.views.items() if _all_there(final, name)}
+    for name in views:
+        for old, new in zip(_files(final, name), _files(partial, name), strict=True):
+            new.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                os.link(old, new)
+            except OSError:  # a file system without hard links
+                shutil.copy2(old, new)
+    log.info("%s: the depth maps of %d views are kept", final.root, len(views))
+    return _Record(views, record.chunks)
 
 
 def _all_there(paths: DensePaths, name: str) -> bool:
     """Whether every file of a view exists; files are atomic, so that those that exist are whole."""
-    files = (paths.image(name), paths.depth_map(name), paths.normal_map(name), paths.confidence_map(name))
-    return all(file.is_file() for file in files)
+    return all(file.is_file() for file in _files(paths, name))
+
+
+def _files(paths: DensePaths, name: str) -> tuple[Path, ...]:
+    """Every file of a view."""
+    return paths.image(name), paths.depth_map(name), paths.normal_map(name), paths.confidence_map(name)
 
 
 def _restore(final: DensePaths, aside: DensePaths) -> None:
@@ -190,6 +234,14 @@ def _read(paths: DensePaths) -> dict[str, object]:
     return manifest if isinstance(manifest, dict) and manifest.get("format") == _FORMAT else {}
 
 
-def _views(paths: DensePaths) -> dict[str, dict[str, object]]:
-    views = _read(paths).get("views")
-    return dict(views) if isinstance(views, dict) else {}
+def _maps_key(paths: DensePaths) -> object:
+    """The fingerprint of the maps; manifests of the first versions have one fingerprint for everything."""
+    manifest = _read(paths)
+    return manifest.get("maps", manifest.get("fingerprint"))
+
+
+def _record(paths: DensePaths) -> _Record:
+    views, chunks = _read(paths).get("views"), _read(paths).get("chunks")
+    return _Record(
+        dict(views) if isinstance(views, dict) else {}, list(chunks) if isinstance(chunks, list) else []
+    )

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,6 +116,7 @@ class Workspace:
         images: registered images whose files are usable, ordered by name.
         reasons: sentences that say why these images and this model.
         skipped: name → why a registered image is not used.
+        unregistered: name → why a picture in the image folder has no camera in this model.
     """
 
     root: Path
@@ -124,6 +126,7 @@ class Workspace:
     images: tuple[Registered, ...]
     reasons: tuple[str, ...]
     skipped: Mapping[str, str] = field(default_factory=dict)
+    unregistered: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def dense(self) -> DensePaths:
@@ -156,7 +159,7 @@ def open_workspace(
     """
     root = existing_root(root)
     folders = [Path(config.model_path)] if config.model_path else find_models(root)
-    model_path, model, reasons = choose_model(root, folders)
+    model_path, model, reasons, elsewhere = choose_model(root, folders)
     entries = _pycolmap.registered(model)
     folder = find_images(root, config.image_path, [entry.name for entry in entries])
     reasons.append(f"images from {folder}")
@@ -171,7 +174,30 @@ def open_workspace(
         log.info("%s", reason)
     if skipped:
         log.warning("%d of %d images are skipped:\n%s", len(skipped), len(entries), listing(skipped))
-    return Workspace(root, folder, model_path, model, images, tuple(reasons), skipped)
+    others = unregistered_images(root, folder, [entry.name for entry in entries], elsewhere)
+    if others:
+        log.warning("%d pictures are not in the model:\n%s", len(others), listing(others))
+    return Workspace(root, folder, model_path, model, images, tuple(reasons), skipped, others)
+
+
+def unregistered_images(
+    root: Path, folder: Path, names: Sequence[str], elsewhere: Mapping[str, Path]
+) -> dict[str, str]:
+    """Name → reason for the pictures in the image folder that the model has no camera of.
+
+    Args:
+        root: the workspace.
+        folder: of the images.
+        names: of the registered images.
+        elsewhere: name → another model of the workspace that has it.
+    """
+    left = sorted(set(list_images(folder, recursive=folder != root)) - set(names))
+    return {
+        name: f"COLMAP registered it in {elsewhere[name]}, not in the model that was chosen"
+        if name in elsewhere
+        else "COLMAP did not register it: too few matches with the images of the model"
+        for name in left
+    }
 
 
 def existing_root(root: Path | str) -> Path:
@@ -244,11 +270,24 @@ def _looks_like_model(folder: Path) -> bool:
     )
 
 
-def choose_model(root: Path, folders: Sequence[Path]) -> tuple[Path, Model, list[str]]:
-    """The model with most registered images; of equals, with most points; of equals, first by name.
+class Chosen(NamedTuple):
+    """The model to use.
 
-    Returns:
-        Its folder, the reconstruction, and sentences on the choice.
+    Attributes:
+        folder: where it is.
+        model: the reconstruction.
+        reasons: sentences on the choice.
+        elsewhere: name → another model that holds an image which this one does not.
+    """
+
+    folder: Path
+    model: Model
+    reasons: list[str]
+    elsewhere: dict[str, Path]
+
+
+def choose_model(root: Path, folders: Sequence[Path]) -> Chosen:
+    """The model with most registered images; of equals, with most points; of equals, first by name.
 
     Raises:
         InputError: no model, none readable, or none with points.
@@ -278,7 +317,8 @@ def choose_model(root: Path, folders: Sequence[Path]) -> tuple[Path, Model, list
     if others:
         reasons[0] += f", the most of {len(models)} models ({'; '.join(others)})"
     reasons += [f"model {folder} not considered: {why}" for folder, why in broken.items()]
-    return best, models[best], reasons
+    elsewhere = {e.name: f for f, other in models.items() if f != best for e in _pycolmap.registered(other)}
+    return Chosen(best, models[best], reasons, elsewhere)
 
 
 def _size(model: Model) -> str:

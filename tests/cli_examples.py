@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +26,9 @@ class OptimiseConfig:
 class ExampleConfig:
     """What the example does."""
 
-    failure: str = knob("none", "how to fail", choices=("none", "interrupt", "terminate", *"abcdefg"))
+    failure: str = knob(
+        "none", "how to fail", choices=("none", "interrupt", "terminate", "environment", *"abcdefg")
+    )
     mask_path: Path | None = knob(None, "folder of masks")
     overwrite: bool = knob(False, "replace earlier results")
     optimise: OptimiseConfig = OptimiseConfig(steps=7)
@@ -47,6 +50,14 @@ class Result:
         return f"{self.workspace} {self.config.optimise.steps} {self.config.overwrite}"
 
 
+class Environment:
+    """What OpenMP is told, and whether torch is there already."""
+
+    def summary(self) -> str:
+        """One line."""
+        return f"{os.environ.get('OMP_WAIT_POLICY')} {'torch' in sys.modules}"
+
+
 ERRORS: dict[str, Exception] = {
     "a": InputError("images/0.jpg is truncated: copy it again"),
     "b": OutOfMemoryError("a chunk of one view does not fit"),
@@ -58,11 +69,13 @@ ERRORS: dict[str, Exception] = {
 }
 
 
-def run(workspace: Path, config: ExampleConfig, progress: Progress) -> Result:
+def run(workspace: Path, config: ExampleConfig, progress: Progress) -> Result | Environment:
     """Report progress, warn, then succeed or fail as the configuration says."""
     progress.stage("work", 2)
     progress.advance(1, loss=0.5)
     warnings.warn("the sky is falling", stacklevel=1)
+    if config.failure == "environment":
+        return Environment()
     if config.failure == "interrupt":
         os.kill(os.getpid(), signal.SIGINT)
     if config.failure == "terminate":

@@ -30,10 +30,15 @@ sys.exit(main(commands=table))
 """
 
 
-def run(*words: str, program: str = PROGRAM) -> subprocess.CompletedProcess[str]:
+def run(
+    *words: str, program: str = PROGRAM, environment: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """The program as a process, without the caller's settings of OpenMP where ``environment`` is given."""
+    kept = {k: v for k, v in os.environ.items() if k not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")}
     return subprocess.run(
-        [sys.executable, "-c", program, *words], cwd=ROOT, capture_output=True, text=True, check=False
-    )
+        [sys.executable, "-c", program, *words], cwd=ROOT, capture_output=True, text=True, check=False,
+        env=None if environment is None else kept | environment,
+    )  # fmt: skip
 
 
 def test_success_prints_the_summary_on_stdout_alone() -> None:
@@ -96,6 +101,16 @@ def test_usage_errors_exit_2_with_the_remedy(words: tuple[str, ...], told: str) 
     assert done.returncode == 2
     assert told in done.stderr
     assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "policy"),
+    [({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE"), ({"GOMP_SPINCOUNT": "5"}, None)],
+)
+def test_idle_threads_sleep_unless_told_otherwise(given: dict[str, str], policy: str | None) -> None:
+    """As the environment has it when the work begins, before which torch is not loaded."""
+    done = run("example", "scene", "--failure", "environment", environment=given)
+    assert done.stdout == f"{policy} False\n"
 
 
 def test_quiet_keeps_warnings_and_drops_progress() -> None:

@@ -31,6 +31,8 @@ START_UP = (
     "_pycolmap",
     "model_files",
     "errors",
+    "weights",
+    "published",
 )
 """Modules of ``colmap_tco`` that the command line imports for their settings: nothing in LAZY at the top."""
 

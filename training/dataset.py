@@ -20,6 +20,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from torch import Tensor
 
 from tco.types import Cameras, Priors, SparseDepth, Views
+from training.photo import photographed
 from training.raytrace import Floats
 from training.scenes import Sample, generate
 
@@ -71,41 +72,6 @@ def flipped(s: Sample) -> Sample:
     )  # fmt: skip
 
 
-def photographed(images: NDArray[np.uint8], rng: np.random.Generator) -> Floats:
-    """What a real camera would add: exposure and white balance a view, vignetting, blur, noise, JPEG.
-
-    Args:
-        images: (V, H, W, 3).
-
-    Returns:
-        (V, H, W, 3) float32 in [0, 1].
-    """
-    v, h, w = images.shape[:3]
-    x = images.astype(np.float32) / 255
-    drift = rng.choice([0.0, 0.04, 0.15])
-    gain = rng.uniform(0.45, 1.15) * np.exp(
-        rng.normal(0, drift, (v, 1, 1, 1)) + rng.normal(0, 0.08 + 0.3 * drift, (v, 1, 1, 3))
-    )
-    grey = x.mean(-1, keepdims=True)
-    x = grey + rng.uniform(0.15, 1.05) * (x - grey)
-    yy, xx = np.meshgrid(np.linspace(-1, 1, h), np.linspace(-1, 1, w), indexing="ij")
-    vignette = 1 - rng.choice([0.0, rng.uniform(0, 0.35)]) * (xx**2 + yy**2)[None, ..., None] / 2
-    x = np.clip(x * gain * vignette, 0, 1) ** rng.uniform(0.8, 1.25)
-    noise = rng.choice([0.0, 0.01, 0.03])
-    for i in range(v):
-        if rng.random() < 0.4:
-            sigma = rng.uniform(0.2, 0.9, 2)
-            x[i] = gaussian_filter(x[i], (sigma[0], sigma[1], 0))
-        if noise:
-            coarse = rng.standard_normal((h, w, 3)) if rng.random() < 0.5 else rng.standard_normal((h, w, 1))
-            x[i] += (noise * rng.uniform(0.5, 1) * coarse).astype(np.float32)
-        if rng.random() < 0.5:
-            quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(50, 96))]
-            code = cv2.imencode(".jpg", np.clip(255 * x[i], 0, 255).astype(np.uint8), quality)[1]
-            x[i] = cv2.imdecode(code, cv2.IMREAD_COLOR).astype(np.float32) / 255
-    return np.clip(x, 0, 1).astype(np.float32)
-
-
 @dataclass(frozen=True)
 class Tracks:
     """Simulated triangulated points: positions, and which view sees which."""
@@ -115,18 +81,37 @@ class Tracks:
     sigma: NDArray[np.float64]
 
 
+def _corners(image: NDArray[np.uint8], sharp: float, least: float, crowding: float) -> Floats:
+    """Chance (H, W), up to a factor, that a pixel becomes a point: root of the smaller structure eigenvalue.
+
+    Raised to ``sharp``, none below ``least`` grey levels a pixel, and more where others are near, by the
+    mean over a twentieth of the width to the power ``crowding``.
+    """
+    grey = gaussian_filter(image.astype(np.float32).mean(-1), 0.7)
+    gy, gx = np.gradient(grey)
+    xx, yy, xy = (gaussian_filter(a, 1.2) for a in (gx * gx, gy * gy, gx * gy))
+    corner = np.sqrt(np.maximum(0, (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy**2)))
+    least = max(0.3, min(least, float(np.quantile(corner, 0.97))))
+    chance = np.where(corner < least, 0, corner**sharp)
+    if crowding > 0:
+        chance = chance * gaussian_filter(np.minimum(corner, 20), 0.05 * image.shape[1]) ** crowding
+    return chance
+
+
 def triangulated(s: Sample, rng: np.random.Generator) -> Tracks:
-    """Points as COLMAP would triangulate them: at corners, in three views or more, noisy, some wrong."""
+    """Points as COLMAP would triangulate them: at corners, in three views or more, noisy, some wrong.
+
+    Many or few, spread out or crowded where there is most texture, with none on plain walls.
+    """
     v, h, w = s.depth.shape
     xyz, pose = [], np.linalg.inv(s.cam_from_world.astype(np.float64))
-    want = int(np.exp(rng.uniform(np.log(60), np.log(1200))))
-    sharp = rng.uniform(0.5, 2.0)
+    few = rng.random() < 0.3
+    want = int(np.exp(rng.uniform(np.log(25 if few else 80), np.log(150 if few else 1500))))
+    sharp, least = rng.uniform(0.5, 2.0), np.exp(rng.uniform(np.log(0.3), np.log(5.0)))
+    crowding = float(rng.choice([0.0, rng.uniform(0.3, 2.0)]))
     for i in range(v):
-        grey = gaussian_filter(s.images[i].astype(np.float32).mean(-1), 0.7)
-        gy, gx = np.gradient(grey)
-        xx, yy, xy = (gaussian_filter(a, 1.2) for a in (gx * gx, gy * gy, gx * gy))
-        corner = np.maximum(0, (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy**2)) ** (sharp / 2)
-        corner[(s.depth[i] <= 0) | (corner < 0.3**sharp)] = 0
+        corner = _corners(s.images[i], sharp, least, crowding)
+        corner[s.depth[i] <= 0] = 0
         if corner.sum() <= 0:
             continue
         flat = (corner / corner.sum()).ravel()
@@ -235,7 +220,7 @@ def main() -> None:
     parser.add_argument("--start", type=int, default=0)
     parser.add_argument("--count", type=int, default=3000)
     parser.add_argument("--views", type=int, default=6)
-    parser.add_argument("--shape", type=int, nargs=2, default=(144, 192), metavar=("H", "W"))
+    parser.add_argument("--shape", type=int, nargs=2, default=(192, 256), metavar=("H", "W"))
     args = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     write(args.out, args.start, args.count, tuple(args.shape), args.views)

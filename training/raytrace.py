@@ -1,7 +1,8 @@
 """A small ray tracer over boxes, ellipsoids and cylinders: exact depth, textured and shadowed colour.
 
-Everything is analytic, so a depth is right to float precision, and one 192×144 view of forty
-primitives takes some tens of milliseconds on one core.
+Everything is analytic, so a depth is right to float precision, and one 256×192 view of two hundred
+primitives takes some forty milliseconds on one core. Compiled code is cached by file: after a change
+in ``intersect.py``, remove ``training/__pycache__``.
 """
 
 from __future__ import annotations
@@ -9,11 +10,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
-BOX, ELLIPSOID, CYLINDER, ROOM = 0, 1, 2, 3
-"""Kinds of primitive. A room is a box seen from inside: rays hit where they leave it."""
+from training.intersect import BOX, CYLINDER, ELLIPSOID, ROOM, local, nearest, one, tree
+
+__all__ = ["BOX", "CYLINDER", "ELLIPSOID", "ROOM", "Floats", "Scene", "mipmaps", "render"]
 
 Floats = NDArray[np.float32]
 
@@ -30,10 +32,24 @@ class Scene(NamedTuple):
         texel: (P,) textures a unit of length.
         tint: (P, 3) factor on the texture, linear RGB.
         gloss: (P,) weight of the mirror-like highlight.
-        lights: (L, 3) positions; the first casts shadows.
+        lights: (L, 3) positions.
         ambient: share of the light that comes from everywhere.
         sky: (3,) colour where nothing is hit.
         mips: :func:`mipmaps` of the textures.
+        power: (L, 2) brightness of each light, and the distance at which it has halved (0: never).
+            None: equal shares of 1.6 · (1 − ambient), never less.
+        shadows: number of lights, from the first, that cast shadows.
+        softness: radius of these lights as a share of their distance.
+        lean: (3,) how much more ambient light there is on surfaces that face along it.
+        detail: (P, 3) a second texture that scales the first: its number, its amplitude about one, and
+            its textures a unit of length. None: none.
+        glow: (P,) light that a surface gives off itself, in units of its colour. None: none.
+        mirror: (P,) share of the light from ahead that is reflected as by glass. None: none.
+        offset: (P, 2) where the texture coordinates start, as lengths. None: zero.
+        clouds: texture that scales the colour of the sky by direction, or −1.
+        upright: the texture's second axis is z on all vertical faces of boxes; otherwise only on two.
+        side: texels along a side of the finest level. One too few makes the pattern lean by a texel a row,
+            as in the published pictures of the demo. 0: the true number.
     """
 
     kind: NDArray[np.int32]
@@ -48,6 +64,54 @@ class Scene(NamedTuple):
     ambient: float
     sky: Floats
     mips: NDArray[np.uint8]
+    power: Floats | None = None
+    shadows: int = 1
+    softness: float = 0.0
+    lean: Floats | None = None
+    detail: Floats | None = None
+    glow: Floats | None = None
+    mirror: Floats | None = None
+    offset: Floats | None = None
+    clouds: int = -1
+    upright: bool = False
+    side: int = 0
+
+
+class _Packed(NamedTuple):
+    """A scene in few arrays, since compiled functions pay for each array that they are handed.
+
+    Attributes:
+        look: (P, 32) of each primitive: textures of the faces (6), texel, tint (3), gloss, detail (3), glow,
+            mirror, offset (2), half sizes (3), rotation (9), kind, one column to spare.
+        lights: (L, 5) position, power, reach.
+        world: (12,) ambient, sky (3), lean (3), shadows, softness, clouds, upright, side.
+        mips: as in :class:`Scene`.
+    """
+
+    look: NDArray[np.float64]
+    lights: NDArray[np.float64]
+    world: NDArray[np.float64]
+    mips: NDArray[np.uint8]
+
+
+def _packed(scene: Scene) -> _Packed:
+    """The scene with zeros, or what they stand for, in the place of every None."""
+    count, lights = len(scene.kind), len(scene.lights)
+    same = np.tile([1.6 * (1 - scene.ambient) / lights, 0.0], (lights, 1))
+    power = same if scene.power is None else scene.power
+    detail = np.zeros((count, 3)) if scene.detail is None else scene.detail
+    glow, mirror = (np.zeros(count) if a is None else a for a in (scene.glow, scene.mirror))
+    offset = np.zeros((count, 2)) if scene.offset is None else scene.offset
+    lean = np.zeros(3) if scene.lean is None else scene.lean
+    side = scene.side or round(np.sqrt(scene.mips.shape[1] * 0.75))
+    columns = (
+        scene.texture, scene.texel, scene.tint, scene.gloss, detail, glow, mirror, offset, scene.half,
+        scene.rotation, scene.kind, np.zeros(count),
+    )  # fmt: skip
+    look = np.concatenate([np.asarray(a, np.float64).reshape(count, -1) for a in columns], 1)
+    rest = [scene.shadows, scene.softness, scene.clouds, scene.upright, side]
+    world = np.concatenate([[scene.ambient], scene.sky, lean, rest]).astype(np.float64)
+    return _Packed(look, np.concatenate([scene.lights, power], 1).astype(np.float64), world, scene.mips)
 
 
 def mipmaps(atlas: Floats) -> NDArray[np.uint8]:
@@ -60,121 +124,28 @@ def mipmaps(atlas: Floats) -> NDArray[np.uint8]:
     return (255 * texels + 0.5).astype(np.uint8)
 
 
-@njit(cache=True, fastmath=True)
-def _box(o, d, inside):  # type: ignore[no-untyped-def]
-    """Entry (or exit, from inside) distance and face of the unit box; (inf, 0) for a miss."""
-    near, far, face_near, face_far = -1e30, 1e30, 0, 0
-    for a in range(3):
-        if abs(d[a]) < 1e-9:
-            if abs(o[a]) > 1.0:
-                return 1e30, 0
-            continue
-        t1, t2 = (-1.0 - o[a]) / d[a], (1.0 - o[a]) / d[a]
-        f1, f2 = 2 * a, 2 * a + 1
-        if t1 > t2:
-            t1, t2, f1, f2 = t2, t1, f2, f1
-        if t1 > near:
-            near, face_near = t1, f1
-        if t2 < far:
-            far, face_far = t2, f2
-    if near > far:
-        return 1e30, 0
-    if inside:
-        return (far, face_far) if far > 1e-4 else (1e30, 0)
-    return (near, face_near) if near > 1e-4 else (1e30, 0)
-
-
-@njit(cache=True, fastmath=True)
-def _quadric(o, d, cylinder):  # type: ignore[no-untyped-def]
-    """First hit of the unit sphere, or of the unit cylinder along z with its caps (faces 4 and 5)."""
-    n = 2 if cylinder else 3
-    a = b = c = 0.0
-    for i in range(n):
-        a += d[i] * d[i]
-        b += o[i] * d[i]
-        c += o[i] * o[i]
-    disc = b * b - a * (c - 1.0)
-    best, face = 1e30, 0
-    if disc > 0 and a > 1e-12:
-        t = (-b - np.sqrt(disc)) / a
-        if t > 1e-4 and (not cylinder or abs(o[2] + t * d[2]) <= 1.0):
-            best = t
-    if cylinder and abs(d[2]) > 1e-9:
-        for side in range(2):
-            t = ((2.0 * side - 1.0) - o[2]) / d[2]
-            x, y = o[0] + t * d[0], o[1] + t * d[1]
-            if 1e-4 < t < best and x * x + y * y <= 1.0:
-                best, face = t, 4 + side
-    return best, face
-
-
-@njit(cache=True, fastmath=True)
-def _local(rotation, centre, half, origin, direction, o, d):  # type: ignore[no-untyped-def]
-    """Ray in the frame in which the primitive is a unit one; the ray parameter is unchanged."""
-    for i in range(3):
-        so = sd = 0.0
-        for j in range(3):
-            so += rotation[i, j] * (origin[j] - centre[j])
-            sd += rotation[i, j] * direction[j]
-        o[i], d[i] = so / half[i], sd / half[i]
-
-
-@njit(cache=True, fastmath=True)
-def _nearest(scene, origin, direction, limit, o, d):  # type: ignore[no-untyped-def]
-    """Distance, primitive and face of the first hit before ``limit``; primitive −1 for none.
-
-    A primitive whose bounding sphere the ray misses is skipped.
-    """
-    kind, rotation, centre, half = scene.kind, scene.rotation, scene.centre, scene.half
-    best, hit, face = limit, -1, 0
-    norm = direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2
-    for p in range(kind.shape[0]):
-        if kind[p] != ROOM:
-            across = dist = reach = 0.0
-            for i in range(3):
-                c = centre[p, i] - origin[i]
-                across += c * direction[i]
-                dist += c * c
-                reach += half[p, i] ** 2
-            if dist > reach and (across < 0 or dist - across * across / norm > reach):
-                continue
-        _local(rotation[p], centre[p], half[p], origin, direction, o, d)
-        if kind[p] == BOX or kind[p] == ROOM:
-            t, f = _box(o, d, kind[p] == ROOM)
-        else:
-            t, f = _quadric(o, d, kind[p] == CYLINDER)
-        if t < best:
-            best, hit, face = t, p, f
-    return best, hit, face
-
-
-@njit(cache=True, fastmath=True)
-def _surface(kind, half, face, q, normal, uv):  # type: ignore[no-untyped-def]
+@njit(cache=True, fastmath=True, nogil=True)
+def _surface(look, p, face, upright, q):  # type: ignore[no-untyped-def]
     """Object-frame normal and metric texture coordinates at the unit-frame point ``q``."""
+    kind, a, b, c = int(look[p, 30]), look[p, 18], look[p, 19], look[p, 20]
     if kind == BOX or kind == ROOM:
-        axis = face // 2
-        for i in range(3):
-            normal[i] = 0.0
-        normal[axis] = (1.0 if face % 2 else -1.0) * (-1.0 if kind == ROOM else 1.0)
-        uv[0] = q[(axis + 1) % 3] * half[(axis + 1) % 3]
-        uv[1] = q[(axis + 2) % 3] * half[(axis + 2) % 3]
-    elif kind == CYLINDER and face >= 4:
-        normal[0], normal[1], normal[2] = 0.0, 0.0, (1.0 if face == 5 else -1.0)
-        uv[0], uv[1] = q[0] * half[0], q[1] * half[1]
-    else:
-        for i in range(3):
-            normal[i] = q[i] / half[i] if (kind == ELLIPSOID or i < 2) else 0.0
-        n = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
-        for i in range(3):
-            normal[i] /= n
-        uv[0] = np.arctan2(q[1], q[0]) * half[0]
-        uv[1] = np.arcsin(min(1.0, max(-1.0, q[2]))) * half[2] if kind == ELLIPSOID else q[2] * half[2]
+        sign = (1.0 if face % 2 else -1.0) * (-1.0 if kind == ROOM else 1.0)
+        if face < 2:
+            return (sign, 0.0, 0.0), q[1] * b, q[2] * c
+        if face < 4:
+            return (0.0, sign, 0.0), (q[0] * a if upright else q[2] * c), (q[2] * c if upright else q[0] * a)
+        return (0.0, 0.0, sign), q[0] * a, q[1] * b
+    if kind == CYLINDER and face >= 4:
+        return (0.0, 0.0, 1.0 if face == 5 else -1.0), q[0] * a, q[1] * b
+    x, y, z = q[0] / a, q[1] / b, (q[2] / c if kind == ELLIPSOID else 0.0)
+    n = np.sqrt(x * x + y * y + z * z)
+    v = np.arcsin(min(1.0, max(-1.0, q[2]))) * c if kind == ELLIPSOID else q[2] * c
+    return (x / n, y / n, z / n), np.arctan2(q[1], q[0]) * a, v
 
 
-@njit(cache=True, fastmath=True)
-def _texture(texels, u, v, level, rgb):  # type: ignore[no-untyped-def]
-    """Bilinear, wrapped lookup at the nearest level of one texture's pyramid."""
-    size = int(np.sqrt(texels.shape[0] * 0.75))
+@njit(cache=True, fastmath=True, nogil=True)
+def _texture(mips, which, size, u, v, level):  # type: ignore[no-untyped-def]
+    """Bilinear, wrapped lookup at the nearest level of a texture's pyramid whose finest side is ``size``."""
     lv, start = int(level + 0.5), 0
     while lv > 0 and size > 1:
         start += size * size
@@ -184,107 +155,201 @@ def _texture(texels, u, v, level, rgb):  # type: ignore[no-untyped-def]
     x0, y0 = int(np.floor(x)), int(np.floor(y))
     fx, fy = x - x0, y - y0
     xa, xb, ya, yb = x0 % size, (x0 + 1) % size, (y0 % size) * size + start, ((y0 + 1) % size) * size + start
-    for c in range(3):
-        top = texels[ya + xa, c] * (1 - fx) + texels[ya + xb, c] * fx
-        bottom = texels[yb + xa, c] * (1 - fx) + texels[yb + xb, c] * fx
-        rgb[c] = (top * (1 - fy) + bottom * fy) / 255.0
+    aa, ab = (1 - fx) * (1 - fy) / 255.0, fx * (1 - fy) / 255.0
+    ba, bb = (1 - fx) * fy / 255.0, fx * fy / 255.0
+    r = mips[which, ya + xa, 0] * aa + mips[which, ya + xb, 0] * ab
+    g = mips[which, ya + xa, 1] * aa + mips[which, ya + xb, 1] * ab
+    b = mips[which, ya + xa, 2] * aa + mips[which, ya + xb, 2] * ab
+    r += mips[which, yb + xa, 0] * ba + mips[which, yb + xb, 0] * bb
+    g += mips[which, yb + xa, 1] * ba + mips[which, yb + xb, 1] * bb
+    b += mips[which, yb + xa, 2] * ba + mips[which, yb + xb, 2] * bb
+    return r, g, b
 
 
-@njit(cache=True, fastmath=True)
-def _lighting(scene, p, point, normal, view, work):  # type: ignore[no-untyped-def]
-    """Diffuse light and highlight at a surface point, seen along the unit vector ``view``."""
-    to_light, o, d = work[0], work[1], work[2]
-    light, shine = scene.ambient, 0.0
-    for k in range(scene.lights.shape[0]):
-        dist = lambert = 0.0
-        for i in range(3):
-            to_light[i] = scene.lights[k, i] - point[i]
-            dist += to_light[i] ** 2
-        dist = np.sqrt(dist) + 1e-6
-        for i in range(3):
-            lambert += to_light[i] / dist * normal[i]
+@njit(cache=True, fastmath=True, nogil=True)
+def _scatter(jitter, axis, k):  # type: ignore[no-untyped-def]
+    """Offset in [−1, 1) along an axis towards a part of light ``k``; a pixel's four rays share it out."""
+    x = ((jitter >> 2) * 73856093) ^ ((axis + 1) * 19349663) ^ (k * 83492791)
+    x = ((x & 0xFFFFFFFF) ^ ((x & 0xFFFFFFFF) >> 13)) * 1274126177 & 0xFFFFFFFF
+    part = ((x ^ (x >> 15)) & 0xFFFF) / 65536.0
+    return (jitter >> axis & 1) + part - 1.0
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _lighting(scene, tree, gloss, jitter, where, stack):  # type: ignore[no-untyped-def]
+    """Diffuse light and highlight ``where`` (point, normal, unit view vector); no shadows if jitter < 0."""
+    world, lights = scene.world, scene.lights
+    point, normal, view = where
+    light, shine = 1 + world[4] * normal[0] + world[5] * normal[1] + world[6] * normal[2], 0.0
+    light *= world[0]
+    for k in range(lights.shape[0]):
+        x, y, z = lights[k, 0] - point[0], lights[k, 1] - point[1], lights[k, 2] - point[2]
+        dist = np.sqrt(x * x + y * y + z * z) + 1e-6
+        if world[8] > 0 and jitter >= 0:
+            spread = world[8] * dist
+            x, y = x + spread * _scatter(jitter, 0, k), y + spread * _scatter(jitter, 1, k)
+            z -= spread * _scatter(jitter, 0, k)
+        lambert = (x * normal[0] + y * normal[1] + z * normal[2]) / dist
         if lambert <= 0:
             continue
-        if k == 0:
-            _, blocker, _ = _nearest(scene, point, to_light, 1.0, o, d)
-            if blocker >= 0 and scene.kind[blocker] != ROOM:
-                continue
-        light += (1 - scene.ambient) * lambert / scene.lights.shape[0] * 1.6
-        if scene.gloss[p] > 0:
-            along = norm = 0.0
-            for i in range(3):
-                h = to_light[i] / dist - view[i]
-                along += h * normal[i]
-                norm += h * h
-            shine += scene.gloss[p] * max(0.0, along / np.sqrt(norm + 1e-9)) ** 40
+        power = lights[k, 3]
+        if lights[k, 4] > 0:
+            power *= lights[k, 4] ** 2 / (lights[k, 4] ** 2 + dist * dist)
+        dark = k < world[7] and jitter >= 0
+        if dark and nearest(tree, point, (x, y, z), 1.0, True, stack)[1] >= 0:
+            continue
+        light += power * lambert
+        if gloss > 0:
+            hx, hy, hz = x / dist - view[0], y / dist - view[1], z / dist - view[2]
+            along = hx * normal[0] + hy * normal[1] + hz * normal[2]
+            shine += gloss * max(0.0, along / np.sqrt(hx * hx + hy * hy + hz * hz + 1e-9)) ** 40
     return light, shine
 
 
-@njit(cache=True, fastmath=True)
-def _add_color(scene, origin, ray, hit, pixel_angle, work, out):  # type: ignore[no-untyped-def]
-    """Add the colour of a hit (distance, primitive, face) to ``out``."""
+@njit(cache=True, fastmath=True, nogil=True)
+def _sky(scene, way):  # type: ignore[no-untyped-def]
+    """The sky's colour along a ray."""
+    world, rgb = scene.world, (1.0, 1.0, 1.0)
+    if world[9] >= 0:
+        flat = np.sqrt(way[0] ** 2 + way[1] ** 2) + 1e-9
+        u, v = np.arctan2(way[1], way[0]) * 0.7, np.arctan2(way[2], flat)
+        rgb = _texture(scene.mips, int(world[9]), int(world[11]), u, v, 1.0)
+    return world[1] * rgb[0], world[2] * rgb[1], world[3] * rgb[2]
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _color(scene, tree, ray, hit, pixel_angle, jitter, stack):  # type: ignore[no-untyped-def]
+    """Colour of a hit (distance, primitive, face) on a ray (origin, direction), and where it is.
+
+    Returns the colour, and the point, the normal and the unit view vector there.
+    """
+    look, mips, side = scene.look, scene.mips, int(scene.world[11])
     t, p, face = hit
-    o, d, q, normal, uv, rgb, point, view = (
-        work[0],
-        work[1],
-        work[3],
-        work[4],
-        work[5],
-        work[6],
-        work[7],
-        work[8],
+    origin, way = ray
+    o, d = local(tree.shapes, p, origin, way)
+    q = (o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2])
+    n, u, v = _surface(look, p, face, scene.world[10] > 0, q)
+    u, v = u + look[p, 16], v + look[p, 17]
+    normal = (
+        look[p, 21] * n[0] + look[p, 24] * n[1] + look[p, 27] * n[2],
+        look[p, 22] * n[0] + look[p, 25] * n[1] + look[p, 28] * n[2],
+        look[p, 23] * n[0] + look[p, 26] * n[1] + look[p, 29] * n[2],
     )
-    rotation, world = scene.rotation[p], work[9]
-    _local(rotation, scene.centre[p], scene.half[p], origin, ray, o, d)
-    length = np.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
-    for i in range(3):
-        q[i] = o[i] + t * d[i]
-        view[i] = ray[i] / length
-    _surface(scene.kind[p], scene.half[p], face, q, normal, uv)
-    facing = 0.0
-    for i in range(3):
-        world[i] = rotation[0, i] * normal[0] + rotation[1, i] * normal[1] + rotation[2, i] * normal[2]
-        facing -= world[i] * view[i]
-    for i in range(3):
-        point[i] = origin[i] + t * ray[i] + 1e-3 * world[i]
-    texel, size = scene.texel[p], np.sqrt(scene.mips.shape[1] * 0.75)
-    level = np.log2(max(1e-6, t * pixel_angle * texel * size / max(0.15, facing)))
-    _texture(scene.mips[scene.texture[p, face]], uv[0] * texel, uv[1] * texel, level, rgb)
-    light, shine = _lighting(scene, p, point, world, view, work)
-    for c in range(3):
-        out[c] += rgb[c] * scene.tint[p, c] * light + shine
+    length = np.sqrt(way[0] ** 2 + way[1] ** 2 + way[2] ** 2)
+    view = (way[0] / length, way[1] / length, way[2] / length)
+    facing = -(normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2])
+    point = (
+        origin[0] + t * way[0] + 1e-3 * normal[0],
+        origin[1] + t * way[1] + 1e-3 * normal[1],
+        origin[2] + t * way[2] + 1e-3 * normal[2],
+    )
+    pixel, fine = t * pixel_angle * np.sqrt(mips.shape[1] * 0.75) / max(0.15, facing), 1.0
+    if look[p, 12] > 0:
+        texel = look[p, 13]
+        level = np.log2(max(1e-6, pixel * texel))
+        fine += look[p, 12] * (2 * _texture(mips, int(look[p, 11]), side, u * texel, v * texel, level)[1] - 1)
+    texel = look[p, 6]
+    level = np.log2(max(1e-6, pixel * texel))
+    rgb = _texture(mips, int(look[p, face]), side, u * texel, v * texel, level)
+    light, shine = _lighting(scene, tree, look[p, 10], jitter, (point, normal, view), stack)
+    light = (light + look[p, 14]) * fine
+    color = (
+        rgb[0] * look[p, 7] * light + shine,
+        rgb[1] * look[p, 8] * light + shine,
+        rgb[2] * look[p, 9] * light + shine,
+    )
+    return color, (point, normal, view)
 
 
-@njit(cache=True, fastmath=True, parallel=True)
-def _trace(scene, inv_k, pose, shape, samples):  # type: ignore[no-untyped-def]
-    """Colour (H, W, 3) from samples² rays a pixel and depth (H, W) of the centre ray; 0 is sky."""
-    height, width = shape
+@njit(cache=True, fastmath=True, nogil=True)
+def _reflected(scene, tree, mirror, where, pixel_angle, stack):  # type: ignore[no-untyped-def]
+    """What a surface mirrors, by Schlick's approximation (1994) of Fresnel's equations."""
+    point, n, v = where
+    facing = -(n[0] * v[0] + n[1] * v[1] + n[2] * v[2])
+    way = (v[0] + 2 * facing * n[0], v[1] + 2 * facing * n[1], v[2] + 2 * facing * n[2])
+    share = mirror * (0.15 + 0.85 * (1 - min(1.0, max(0.0, facing))) ** 5)
+    hit = nearest(tree, point, way, 1e4, False, stack)
+    if hit[1] < 0:
+        seen = _sky(scene, way)
+    else:
+        seen = _color(scene, tree, (point, way), hit, 4 * pixel_angle, -1, stack)[0]
+    return share * seen[0], share * seen[1], share * seen[2]
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _aim(inv_k, pose, u, v):  # type: ignore[no-untyped-def]
+    """World ray of unit camera z through the pixel coordinates (u, v)."""
+    x, y = inv_k[0, 0] * u + inv_k[0, 2], inv_k[1, 1] * v + inv_k[1, 2]
+    return (
+        pose[0, 0] * x + pose[0, 1] * y + pose[0, 2],
+        pose[1, 0] * x + pose[1, 1] * y + pose[1, 2],
+        pose[2, 0] * x + pose[2, 1] * y + pose[2, 2],
+    )
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _centres(tree, inv_k, pose, depth, what):  # type: ignore[no-untyped-def]
+    """Depth (H, W) and hit (H, W), 8 · primitive + face or −1, of the rays through the pixel centres."""
+    stack, origin = np.empty(100, np.int32), (pose[0, 3], pose[1, 3], pose[2, 3])
+    for row in range(depth.shape[0]):
+        for col in range(depth.shape[1]):
+            way = _aim(inv_k, pose, col + 0.5, row + 0.5)
+            t, p, face = nearest(tree, origin, way, 1e4, False, stack)
+            depth[row, col] = t if p >= 0 else 0.0
+            what[row, col] = 8 * p + face if p >= 0 else -1
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _alone(what, row, col):  # type: ignore[no-untyped-def]
+    """The hit that a pixel and its eight neighbours share, or −2."""
+    for r in range(max(0, row - 1), min(what.shape[0], row + 2)):
+        for c in range(max(0, col - 1), min(what.shape[1], col + 2)):
+            if what[r, c] != what[row, col]:
+                return -2
+    return what[row, col]
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _trace(scene, tree, inv_k, pose, what, samples, stride):  # type: ignore[no-untyped-def]
+    """Colour (H, W, 3) from samples² rays a pixel, where ``what`` was hit at the pixels' centres.
+
+    Inside a surface, as the centres of the neighbouring pixels tell, only that surface is tried, and only
+    every ``stride``-th of the rays is cast.
+    """
+    height, width = what.shape
     color = np.zeros((height, width, 3), np.float32)
-    depth = np.zeros((height, width), np.float32)
     pixel_angle = inv_k[0, 0] / samples
-    for row in prange(height):
-        work, ray, origin = np.empty((10, 3)), np.empty(3), pose[:3, 3].copy()
+    stack, origin = np.empty(100, np.int32), (pose[0, 3], pose[1, 3], pose[2, 3])
+    for row in range(height):
         for col in range(width):
-            for s in range(samples * samples + 1):
-                middle = s == samples * samples
-                dx = 0.5 if middle else (s % samples + 0.5) / samples
-                dy = 0.5 if middle else (s // samples + 0.5) / samples
-                x, y = inv_k[0, 0] * (col + dx) + inv_k[0, 2], inv_k[1, 1] * (row + dy) + inv_k[1, 2]
-                for i in range(3):
-                    ray[i] = pose[i, 0] * x + pose[i, 1] * y + pose[i, 2]
-                t, p, face = _nearest(scene, origin, ray, 1e4, work[0], work[1])
-                if middle:
-                    depth[row, col] = t if p >= 0 else 0.0
-                elif p < 0:
-                    color[row, col] += scene.sky
+            alone, rays = _alone(what, row, col), 0
+            for s in range(0, samples * samples, stride if alone != -2 else 1):
+                rays += 1
+                across, down = (s % samples + 0.5) / samples, (s // samples + 0.5) / samples
+                way = _aim(inv_k, pose, col + across, row + down)
+                t, p, face = 1e30, -1, 0
+                if alone >= 0:
+                    t, face = one(tree.shapes, alone // 8, origin, way)
+                    p = alone // 8 if t < 1e4 else -1
+                if p < 0 and alone != -1:
+                    t, p, face = nearest(tree, origin, way, 1e4, False, stack)
+                if p < 0:
+                    rgb = _sky(scene, way)
                 else:
-                    _add_color(scene, origin, ray, (t, p, face), pixel_angle, work, color[row, col])
-            color[row, col] /= samples * samples
-    return color, depth
+                    jitter, hit = (row * width + col) * 4 + s % 4, (t, p, face)
+                    rgb, where = _color(scene, tree, (origin, way), hit, pixel_angle, jitter, stack)
+                    if scene.look[p, 15] > 0:
+                        more = _reflected(scene, tree, scene.look[p, 15], where, pixel_angle, stack)
+                        rgb = (rgb[0] + more[0], rgb[1] + more[1], rgb[2] + more[2])
+                for c in range(3):
+                    color[row, col, c] += rgb[c]
+            for c in range(3):
+                color[row, col, c] /= rays
+    return color
 
 
 def render(
-    scene: Scene, K: Floats, world_from_cam: Floats, shape: tuple[int, int], samples: int = 2
+    scene: Scene, K: Floats, world_from_cam: Floats, shape: tuple[int, int], samples: int = 2, stride: int = 1
 ) -> tuple[Floats, Floats]:
     """One view of a scene.
 
@@ -294,10 +359,13 @@ def render(
         world_from_cam: (4, 4).
         shape: (H, W).
         samples: rays a pixel along each axis.
+        stride: within a surface, cast only every so many of them; 3 leaves the diagonal of four.
 
     Returns:
         Linear colour (H, W, 3), about [0, 1], and camera z (H, W), 0 for sky.
     """
-    inverse = np.linalg.inv(K.astype(np.float64))
-    color, depth = _trace(scene, inverse, world_from_cam.astype(np.float64), shape, samples)
-    return color, depth
+    inverse, pose = np.linalg.inv(K.astype(np.float64)), world_from_cam.astype(np.float64)
+    boxes = tree(scene.kind, scene.rotation, scene.centre, scene.half)
+    depth, what = np.zeros(shape, np.float32), np.zeros(shape, np.int32)
+    _centres(boxes, inverse, pose, depth, what)
+    return _trace(_packed(scene), boxes, inverse, pose, what, samples, stride), depth

@@ -23,6 +23,7 @@ from colmap_tco.chunks import plan_chunks
 from colmap_tco.cli import main
 from colmap_tco.densify import Densified, DensifyConfig, densify
 from colmap_tco.errors import InputError, PartlyDoneError
+from colmap_tco.lock import locked
 from colmap_tco.maps import read_map
 from colmap_tco.ply import read_ply, read_vis
 from colmap_tco.predict import NetworkConfig
@@ -322,7 +323,65 @@ def test_images_that_cannot_be_used_are_left_out_and_named(fresh_room: Room) -> 
     assert "cannot be decoded" in report["views"][cut]["why"]
     assert len(read_ply(fresh_room.root / "dense-tco" / "fused.ply")[0]) > 2000
     assert missing not in poses(fresh_room.root / "dense-tco" / "sparse")
-    assert not made(fresh_room.root, config()).fresh
+    before = bytes_of(fresh_room.root, besides=())
+    with pytest.raises(PartlyDoneError, match=r"already made[^$]*2 images were left out"):
+        made(fresh_room.root, config())
+    assert bytes_of(fresh_room.root, besides=()) == before
+
+
+def test_pictures_that_are_not_in_the_model_are_named_and_harm_nothing(fresh_room: Room) -> None:
+    """One that no model has, and one that only a smaller model has."""
+    import shutil
+
+    pictures, name = fresh_room.root / "images", "other.png"
+    shutil.copy(pictures / fresh_room.names[0], pictures / "new.png")
+    shutil.copy(pictures / fresh_room.names[1], pictures / name)
+    smaller = fresh_room.root / "sparse" / "1"
+    shutil.copytree(fresh_room.root / "sparse" / "0", smaller)
+    model = _pycolmap.read_model(smaller)
+    entries = _pycolmap.registered(model)
+    model.images[entries[1].image_id].name = name
+    for entry in entries[4:]:
+        model.deregister_frame(model.images[entry.image_id].frame_id)
+    for text in smaller.glob("*.txt"):
+        text.unlink()
+    model.write(str(smaller))
+    report = made(fresh_room.root, config()).report
+    assert report["images"] == {"used": len(fresh_room.names), "skipped": 0, "unregistered": 2}
+    states = {image: figures["state"] for image, figures in report["views"].items()}
+    assert states == {
+        **dict.fromkeys(fresh_room.names, "used"), "new.png": "unregistered", name: "unregistered"
+    }  # fmt: skip
+    assert "did not register" in report["views"]["new.png"]["why"]
+    assert f"registered it in {smaller}" in report["views"][name]["why"]
+
+
+def test_other_settings_of_the_fusion_keep_the_depth_maps(fresh_room: Room) -> None:
+    """The same bytes from the same time, in a new cloud; and the cloud of a run from the beginning."""
+    settings = config(steps=1)
+    first = made(fresh_room.root, settings)
+    files = {path.relative_to(first.folder): path.stat() for path in first.folder.rglob("stereo/*/*.bin")}
+    loose = replace(settings, fusion=replace(settings.fusion, min_num_pixels=2))
+    with pytest.raises(InputError, match="its depth maps will be kept"):
+        made(fresh_room.root, loose)
+    second = made(fresh_room.root, replace(loose, overwrite=True))
+    for name, status in files.items():
+        now = (second.folder / name).stat()
+        assert (now.st_ino, now.st_mtime_ns) == (status.st_ino, status.st_mtime_ns)
+    assert second.report["points"] > first.report["points"]
+    assert second.report["loss"] == first.report["loss"] and len(first.report["loss"][0]) == 1
+    assert second.report["views"] == first.report["views"]
+    assert not made(fresh_room.root, loose).fresh
+    anew = made(fresh_room.root, replace(loose, overwrite=True))
+    some = next(iter(files))
+    assert (anew.folder / some).stat().st_ino != files[some].st_ino
+    assert anew.report["points"] == second.report["points"]
+
+
+def test_a_workspace_in_use_is_refused(fresh_room: Room) -> None:
+    with locked(fresh_room.root), pytest.raises(InputError, match="another run is working on"):
+        made(fresh_room.root, config())
+    assert sorted(p.name for p in fresh_room.root.iterdir()) == ["images", "sparse"]
 
 
 def keep_points_of(root: Path, name: str, kept: Callable[[int], bool], most: int) -> None:
@@ -502,5 +561,6 @@ def test_exit_code_6_when_an_image_is_missing(
     command: Callable[..., int], fresh_room: Room, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (fresh_room.root / "images" / fresh_room.names[0]).unlink()
-    assert command("densify", str(fresh_room.root), *FLAGS, "--steps", "0") == 6
-    assert "1 images were left out" in capsys.readouterr().err
+    for _ in range(2):
+        assert command("densify", str(fresh_room.root), *FLAGS, "--steps", "0") == 6
+        assert "1 images were left out" in capsys.readouterr().err

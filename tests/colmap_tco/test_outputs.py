@@ -375,6 +375,23 @@ def test_a_partial_result_of_other_settings_is_dropped(workspace: Path) -> None:
     assert not (result.paths.root / "left.bin").exists()
 
 
+def test_work_on_maps_is_kept_where_only_what_follows_differs(workspace: Path) -> None:
+    """In a partial folder and from a published result; not where the maps themselves would differ."""
+    _, views = opened(workspace)
+    result = open_result(workspace, "one", maps="m")
+    write_view(result.paths, views[0], maps_of(views[0]))
+    result.mark_done(views[0].name, {"a": 1})
+    result.mark_chunk({"loss": [1.5]})
+    again = open_result(workspace, "two", maps="m")
+    assert again.views == {views[0].name: {"a": 1}} and again.chunks == [{"loss": [1.5]}]
+    again.publish()
+    third = open_result(workspace, "three", overwrite=True, maps="m")
+    assert third.views == again.views and third.chunks == again.chunks and not third.finished
+    final, partial = dense_paths(workspace), partial_paths(workspace)
+    assert partial.depth_map(views[0].name).samefile(final.depth_map(views[0].name))
+    assert not open_result(workspace, "three", overwrite=True, maps="n").views
+
+
 def test_overwriting_must_be_asked_for_and_replaces_at_the_end(workspace: Path) -> None:
     densify(workspace, seed=1)
     old = dense_paths(workspace).manifest.read_bytes()

@@ -18,12 +18,12 @@ from training.dataset import (
     flipped,
     jittered,
     load,
-    photographed,
     read,
     resized,
     triangulated,
     write,
 )
+from training.photo import _shaken, photographed
 from training.scenes import Sample, generate
 
 SHAPE = (72, 96)
@@ -168,7 +168,20 @@ def test_photographs_are_in_range_reproducible_and_still_pictures_of_the_scene(s
         assert np.array_equal(picture, photographed(scene.images, np.random.default_rng(seed)))
         grey = [x.reshape(4, -1, 3).mean(2) for x in (picture, scene.images.astype(float))]
         for ours, theirs in zip(*grey, strict=True):
-            assert np.corrcoef(ours, theirs)[0, 1] > 0.6
+            assert np.corrcoef(ours, theirs)[0, 1] > 0.5
+
+
+def test_a_shaken_camera_blurs_along_its_way_and_keeps_the_light() -> None:
+    image = np.zeros((41, 41, 3), np.float32)
+    image[20, 20] = 1
+    spread = _shaken(image, 8.0, 0.0)[..., 0]
+    assert spread.sum() == pytest.approx(1, abs=1e-5)
+    y, x = np.mgrid[0:41, 0:41] - 20
+    assert (spread * x).sum() == pytest.approx(0, abs=1e-4)
+    assert (spread * x**2).sum() == pytest.approx(8.0**2 / 12, rel=0.1)  # a line of eight pixels
+    assert (spread * y**2).sum() < 0.1
+    turned = _shaken(image, 8.0, np.pi / 2)[..., 0]
+    np.testing.assert_allclose(turned, spread.T, atol=1e-3)
 
 
 def test_samples_survive_the_disk_and_are_rendered_once(tmp_path: Path) -> None:

@@ -202,3 +202,77 @@ def test_mipmaps_keep_the_mean_at_every_level() -> None:
         np.testing.assert_allclose(level.mean(1), atlas.mean((1, 2)), atol=0.005)
         start += size * size
     np.testing.assert_allclose(texels[:, 256].astype(float) / 255, atlas[:, :2, :2].mean((1, 2)), atol=0.003)
+
+
+def test_of_many_primitives_the_nearest_is_found() -> None:
+    """What the tree finds is the smallest of what each primitive gives alone."""
+    rng = np.random.default_rng(7)
+    kinds = rng.choice([BOX, ELLIPSOID, CYLINDER], 40)
+    parts = [(int(k), turn(rng), rng.normal(0, 1.5, 3), np.full(3, rng.uniform(0.05, 0.5))) for k in kinds]
+    pose = camera(np.array([0, -5.0, 0.5]), np.zeros(3)).astype(np.float32)
+    _, depth = render(scene(*parts), K, pose, SHAPE, 1)
+    alone = np.stack([render(scene(part), K, pose, SHAPE, 1)[1] for part in parts])
+    first = np.where(alone > 0, alone, np.inf).min(0)
+    np.testing.assert_allclose(depth, np.where(np.isfinite(first), first, 0), rtol=1e-6)
+    assert 0.2 < (depth > 0).mean() < 1
+
+
+def test_fewer_rays_within_a_surface_give_nearly_the_same_picture() -> None:
+    rng = np.random.default_rng(2)
+    parts = [(BOX, turn(rng), rng.normal(0, 1, 3), rng.uniform(0.2, 0.6, 3)) for _ in range(6)]
+    pose = camera(np.array([0, -5.0, 0.5]), np.zeros(3)).astype(np.float32)
+    lit = scene(*parts, ambient=0.2, lights=np.array([[3.0, -6, 4]]))
+    (full, depth), (quick, same) = (render(lit, K, pose, SHAPE, 2, stride) for stride in (1, 3))
+    assert np.array_equal(depth, same)
+    assert np.abs(full - quick).mean() < 0.01
+
+
+WALL = (BOX, np.eye(3), np.array([0, 0, 4.5]), np.array([20.0, 20, 0.5]))
+
+
+def test_power_falls_by_half_at_its_reach_and_lean_adds_to_ambient_light() -> None:
+    base = scene(WALL, ambient=0.1, lights=np.zeros((1, 3)))
+    for reach, share in ((0.0, 1.0), (4.0, 0.5), (2.0, 0.2)):
+        color, _ = render(base._replace(power=np.array([[0.8, reach]])), K, UPRIGHT, SHAPE, 1)
+        assert color[15, 20, 0] == pytest.approx(0.1 + 0.8 * share, rel=2e-3)
+    leaning = base._replace(power=np.zeros((1, 2)), lean=np.array([0, 0, -0.5]))  # the wall faces −z
+    color, _ = render(leaning, K, UPRIGHT, SHAPE, 1)
+    np.testing.assert_allclose(color, 0.15, rtol=1e-5)
+
+
+def test_glow_adds_light_and_detail_scales_it() -> None:
+    """Texture of one half everywhere: a detail of amplitude a about one half changes nothing."""
+    grey = np.full((1, 4, 4, 3), 0.5)
+    base = scene(WALL, ambient=0.4, texture=grey)._replace(power=np.zeros((1, 2)), glow=np.array([0.6]))
+    level = 128 / 255
+    color, _ = render(base, K, UPRIGHT, SHAPE, 1)
+    np.testing.assert_allclose(color, level * 1.0, rtol=1e-5)
+    color, _ = render(base._replace(detail=np.array([[0.0, 0.2, 1.0]])), K, UPRIGHT, SHAPE, 1)
+    np.testing.assert_allclose(color, level * (1 + 0.2 * (2 * level - 1)), rtol=1e-5)
+
+
+def test_a_mirror_shows_what_is_before_it() -> None:
+    """A black floor of mirror m adds m · (0.15 + 0.85 · (1 − cos)⁵) of the sky, which is all it sees."""
+    floor = (BOX, np.eye(3), np.array([0, 2.0, 0]), np.array([50.0, 1.0, 50]))  # y points down; top at y = 1
+    dark = scene(floor, ambient=0.0, texture=np.zeros((1, 4, 4, 3)))._replace(power=np.zeros((1, 2)))
+    color, depth = render(dark._replace(mirror=np.array([0.5])), K, UPRIGHT, SHAPE, 1)
+    y, x = np.meshgrid(np.arange(SHAPE[0]) + 0.5, np.arange(SHAPE[1]) + 0.5, indexing="ij")
+    ray = np.stack([(x - 20) / 45, (y - 15) / 45, np.ones_like(x)], -1)
+    cosine = ray[..., 1] / np.linalg.norm(ray, axis=-1)
+    hit = depth > 0
+    assert hit.any() and not hit.all()
+    share = 0.5 * (0.15 + 0.85 * (1 - cosine[hit]) ** 5)
+    np.testing.assert_allclose(color[hit], share[:, None] * np.array(SKY), rtol=1e-4)
+
+
+def test_a_soft_light_casts_a_penumbra_and_no_light_leaks() -> None:
+    """The screen of the hard shadow's test: full light and full shadow where no part of the light decides."""
+    screen = (BOX, np.eye(3), np.array([0, -7.0, 2.0]), np.array([20.0, 5.0, 0.1]))
+    lit = scene(WALL, screen, ambient=0.3, lights=np.array([[0.0, -4.0, 0.0]]))
+    hard, _ = render(lit, K, UPRIGHT, SHAPE, 2)
+    soft, _ = render(lit._replace(softness=0.03), K, UPRIGHT, SHAPE, 2)
+    height, edge = ((np.arange(SHAPE[0]) + 0.5) - 15) / 45 * 4, -4 + 8 / 1.9
+    far = np.abs(height - edge) > 0.5
+    np.testing.assert_allclose(soft[far], hard[far], atol=0.05)
+    near = np.abs(height - edge) < 0.1
+    assert ((soft[near] > 0.35) & (soft[near] < 0.9)).any()

@@ -53,7 +53,7 @@ def test_depths_of_different_views_agree(samples: dict[str, Sample], kind: str) 
             color.append(np.abs(ours - s.images[b][y[ok], x[ok]][good]).mean(1))
     assert total > 1000
     assert match > 0.6 * total
-    assert front < 0.03 * total  # edges, where a pixel stands for two surfaces
+    assert front < 0.05 * total  # edges, where a pixel stands for two surfaces
     assert np.median(np.concatenate(color)) < 12  # of 255: the same surface in the same light
 
 

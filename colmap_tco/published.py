@@ -1,0 +1,161 @@
+"""The networks that ``--backbone`` can name: where their weights are, under which licence, how they load.
+
+The facts on checkpoints are those of their publishers: VGGT's README of 29 July 2025 and its model cards
+(``facebook/VGGT-1B``: CC BY-NC 4.0; ``facebook/VGGT-1B-Commercial``: VGGT License v1, on request), and the
+table of licences in π³'s README. Revisions are pinned, so that size and SHA-256 are those of one file for
+ever.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A published file of weights.
+
+    Attributes:
+        repository: on the Hugging Face hub.
+        revision: the commit that the other facts are of.
+        file: its name in the repository.
+        size: in bytes.
+        sha256: of its bytes.
+        licence: its name.
+        terms: what the licence says of commercial use, as a sentence for the user.
+        commercial: whether commercial use is allowed.
+        licence_url: where its text is.
+        gated: whether the publisher gives access on request alone.
+    """
+
+    repository: str
+    revision: str
+    file: str
+    size: int
+    sha256: str
+    licence: str
+    terms: str
+    commercial: bool
+    licence_url: str
+    gated: bool = False
+
+    @property
+    def page(self) -> str:
+        """The repository's page."""
+        return f"https://huggingface.co/{self.repository}"
+
+
+@dataclass(frozen=True)
+class Network:
+    """A network that can be chosen.
+
+    Attributes:
+        name: as ``--backbone`` spells it.
+        title: what it is.
+        loader: ``module:function``, called with the file of weights and ``device=``; gives a
+            :class:`tco.backbones.base.Backbone`.
+        kind: whose weights it takes, as :func:`tco.backbones.identify.identify` tells.
+        checkpoint: where its weights are published; None if they are in the package.
+        image_size: longer side of the images that it was trained with, pixels.
+        stride: sides of images are multiples of this.
+        tco: settings of :class:`tco.options.TCOConfig` that suit this network, for those which the user
+            left at their defaults.
+    """
+
+    name: str
+    title: str
+    loader: str
+    kind: str
+    checkpoint: Checkpoint | None
+    image_size: int
+    stride: int
+    tco: Mapping[str, Any] = field(default_factory=dict)
+
+
+_PAPER = {"lora_targets": ("qkv", "proj", "fc1", "fc2"), "rate": 5e-4}
+"""Layers with adapters and learning rate of the published code (arXiv 2604.03878)."""
+
+_VGGT_LICENCE = "https://github.com/facebookresearch/vggt/blob/main/LICENSE.txt"
+
+NETWORKS: dict[str, Network] = {
+    network.name: network
+    for network in (
+        Network(
+            name="sweep",
+            title="plane sweep with known cameras, in the package",
+            loader="tco.backbones.weights:load_sweep",
+            kind="sweep",
+            checkpoint=None,
+            image_size=256,
+            stride=16,
+        ),
+        Network(
+            name="vggt",
+            title="VGGT-1B (Wang et al. 2025)",
+            loader="tco.backbones.vggt:load",
+            kind="vggt",
+            checkpoint=Checkpoint(
+                repository="facebook/VGGT-1B",
+                revision="860abec7937da0a4c03c41d3c269c366e82abdf9",
+                file="model.safetensors",
+                size=5_026_367_224,
+                sha256="f164acf60724910d8fe1578bb499d800850c7bb0948db7555c413f9fbe60467e",
+                licence="CC BY-NC 4.0",
+                terms="no commercial use; for that there is vggt-commercial",
+                commercial=False,
+                licence_url="https://creativecommons.org/licenses/by-nc/4.0/",
+            ),
+            image_size=518,
+            stride=14,
+            tco=_PAPER,
+        ),
+        Network(
+            name="vggt-commercial",
+            title="VGGT-1B, trained for commercial use",
+            loader="tco.backbones.vggt:load",
+            kind="vggt",
+            checkpoint=Checkpoint(
+                repository="facebook/VGGT-1B-Commercial",
+                revision="ebb29a532abe92960eeb6903a5530f16990ef4ab",
+                file="model.safetensors",
+                size=5_026_367_224,
+                sha256="2b766b284359bc47ce26be107254621f685b758a0282082ff109f3ff02788b53",
+                licence="VGGT License v1",
+                terms="commercial use allowed, military use not; access is given on request",
+                commercial=True,
+                licence_url=_VGGT_LICENCE,
+                gated=True,
+            ),
+            image_size=518,
+            stride=14,
+            tco=_PAPER,
+        ),
+        Network(
+            name="pi3",
+            title="π³ (Wang et al. 2025)",
+            loader="tco.backbones.pi3:load",
+            kind="pi3",
+            checkpoint=Checkpoint(
+                repository="yyfz233/Pi3",
+                revision="ae722e7039287d0c8fde9f11f197f804f44b510c",
+                file="model.safetensors",
+                size=3_834_909_248,
+                sha256="33580e4702ac671558aedeab1148fd08118f7ce45bdbeb99f3e3cf340062875d",
+                licence="CC BY-NC 4.0",
+                terms="no commercial use",
+                commercial=False,
+                licence_url="https://creativecommons.org/licenses/by-nc/4.0/",
+            ),
+            image_size=518,
+            stride=14,
+            tco=_PAPER,
+        ),
+    )
+}
+
+PUBLISHED: dict[str, tuple[Network, Checkpoint]] = {
+    name: (network, network.checkpoint) for name, network in NETWORKS.items() if network.checkpoint
+}
+"""Those whose weights have to be fetched."""

@@ -1,0 +1,156 @@
+"""Read checkpoints of published networks: strict in names and shapes, clear about what a file is instead."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pickle
+import typing
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from tco.backbones.weights import WeightsError, read_file
+
+_Config = TypeVar("_Config")
+_Network = TypeVar("_Network", bound=nn.Module)
+
+CONFIG = "config"
+"""Key of the sizes, as JSON, in the metadata of files that :func:`save` wrote."""
+
+
+def load_network(
+    path: Path,
+    build: Callable[[_Config], _Network],
+    published: _Config,
+    skipped: tuple[str, ...] = (),
+) -> _Network:
+    """A network on the CPU with the tensors of a file, which are not copied.
+
+    Args:
+        path: a file that :func:`read` reads.
+        build: the network's class; called with sizes, on the meta device, so that nothing is initialised.
+        published: the sizes, unless the file's metadata has others.
+        skipped: prefixes of names that the file may hold and that the network has no use for.
+
+    Raises:
+        WeightsError: see :func:`read`; names or shapes differ from those of the network.
+    """
+    tensors, info = read(path)
+    config = _sizes(info[CONFIG], type(published), path) if CONFIG in info else published
+    with torch.device("meta"):
+        network = build(config)
+    used = {name: tensor for name, tensor in tensors.items() if not name.startswith(skipped or ("\0",))}
+    check(network, used, path)
+    network.load_state_dict(used, assign=True)
+    return network
+
+
+def save(path: Path, network: nn.Module, config: Any) -> None:
+    """Write a network as safetensors, with its sizes (a dataclass) in the metadata."""
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in network.state_dict().items()}
+    save_file(tensors, path, {"format": "pt", CONFIG: json.dumps(dataclasses.asdict(config))})
+
+
+def read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors on the CPU and metadata of a safetensors file or one of ``torch.save``, told by its content.
+
+    Raises:
+        WeightsError: the file is missing, damaged, of another format, or not a plain table of tensors.
+    """
+    if not path.is_file():
+        raise WeightsError(f"{path}: no such file of weights")
+    with path.open("rb") as file:
+        head = file.read(512)
+    if head.startswith(b"PK\x03\x04"):
+        return _read_torch(path), {}
+    foreign = _kind(head)
+    if foreign:
+        raise WeightsError(
+            f"{path}: this is {foreign}, not weights in the format of safetensors or torch.save; "
+            "fetch the file itself"
+        )
+    return read_file(path)
+
+
+def _kind(head: bytes) -> str | None:
+    """What a file is that begins so, if it is something often found in place of weights."""
+    if not head:
+        return "an empty file"
+    if head.startswith(b"version https://git-lfs"):
+        return "a pointer of Git LFS"
+    if head.lstrip()[:1] == b"<":
+        return "a web page"
+    if head.startswith(b"\x80"):
+        return "a Python pickle, which could run code when it is read"
+    return None
+
+
+def _read_torch(path: Path) -> dict[str, Tensor]:
+    """Tensors of a zip archive as ``torch.save`` writes it; only tensors are accepted, no other objects."""
+    try:
+        content: Any = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except pickle.UnpicklingError as error:
+        raise WeightsError(f"{path}: it holds more than tensors, which could run code when read") from error
+    except (RuntimeError, EOFError, ValueError, OSError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise WeightsError(
+            f"{path}: not a complete file of torch.save ({reason}); fetch or copy it again"
+        ) from error
+    if not isinstance(content, dict) or not all(isinstance(t, Tensor) for t in content.values()):
+        inside = type(content).__name__
+        if isinstance(content, dict):
+            inside = "entries " + ", ".join(map(str, list(content)[:4]))
+        raise WeightsError(f"{path}: expected a plain table of tensors by name, found {inside}")
+    return content
+
+
+def check(network: nn.Module, tensors: Mapping[str, Tensor], path: Path) -> None:
+    """See that names and shapes are exactly those of the network's state dict.
+
+    Raises:
+        WeightsError: they are not; the message counts and names what differs.
+    """
+    want = {name: tuple(t.shape) for name, t in network.state_dict().items()}
+    have = {name: tuple(t.shape) for name, t in tensors.items()}
+    if want == have:
+        return
+    shapes = [
+        f"{name} is {have[name]} instead of {want[name]}"
+        for name in want
+        if name in have and have[name] != want[name]
+    ]
+    kinds = {
+        "missing": [name for name in want if name not in have],
+        "unknown": [name for name in have if name not in want],
+        "of another shape": shapes,
+    }
+    parts = [f"{len(v)} {k} ({', '.join(v[:3])}{', …' * (len(v) > 3)})" for k, v in kinds.items() if v]
+    raise WeightsError(
+        f"{path}: these {len(have)} tensors are not the {len(want)} of {type(network).__name__}: "
+        f"{'; '.join(parts)}"
+    )
+
+
+def _sizes(text: str, kind: type[_Config], path: Path) -> _Config:
+    """Sizes of a network from the JSON that :func:`save` wrote."""
+    try:
+        return _from_table(json.loads(text), kind)
+    except (json.JSONDecodeError, TypeError, AttributeError) as error:
+        raise WeightsError(f"{path}: its metadata does not hold a {kind.__name__} ({error})") from error
+
+
+def _from_table(table: Mapping[str, Any], kind: Any) -> Any:
+    """A dataclass, with dataclasses and tuples in it, from what ``asdict`` and JSON made of it."""
+    hints = typing.get_type_hints(kind)
+    values = {}
+    for name, value in dict(table).items():
+        if dataclasses.is_dataclass(hints.get(name)):
+            values[name] = _from_table(value, hints[name])
+        else:
+            values[name] = tuple(value) if isinstance(value, list) else value
+    return kind(**values)
