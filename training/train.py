@@ -14,7 +14,8 @@ import logging
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
 
@@ -33,6 +34,8 @@ from training.dataset import load
 
 logger = logging.getLogger(__name__)
 
+Drawn = tuple[tuple[Views, Priors, Tensor], np.random.Generator]
+
 
 @dataclass(frozen=True)
 class TrainConfig:
@@ -40,9 +43,12 @@ class TrainConfig:
 
     Attributes:
         steps: length of the cosine schedule. rate: peak learning rate. warmup: steps to reach it.
-        sizes: (share of the steps after which it starts, H, W) of the samples; a quarter keeps the size before.
+        sizes: (share of the steps after which it starts, H, W) of the samples; a quarter keep
+            the size before.
         refined: views a step whose refinement is trained; all views train the coarse stage.
         average: decay of the moving average of the weights.
+        minutes: if not 0, the schedule runs by the clock and ends after so long, whatever ``steps`` says;
+            where a machine is lent for a time. Such a training does not repeat to the last bit.
         newest: share of the samples that come from the last folder, where there are several.
         held_out: samples with the lowest numbers, kept for validation.
     """
@@ -53,6 +59,7 @@ class TrainConfig:
     sizes: tuple[tuple[float, int, int], ...] = ((0.0, 96, 128), (0.6, 144, 192), (0.9, 192, 256))
     refined: int = 3
     average: float = 0.995
+    minutes: float = 0.0
     newest: float = 0.6
     held_out: int = 16
     seed: int = 0
@@ -119,7 +126,7 @@ def losses(net: Sweep, sample: tuple, refined: list[int], sources: int) -> tuple
     first = net.coarse(encoded, range(len(views)))
     total = coarse_loss(first, encoded, pooled(depth, 4))
     world = first.detached().doubled()
-    stage = first[torch.tensor(refined)]
+    stage = first[torch.tensor(refined, device=depth.device)]
     figures = {"coarse": float(total.detach())}
     for k in range(len(net.config.spacing)):
         stage = net.refine(k, encoded, refined, stage, world)
@@ -148,17 +155,24 @@ class Trainer:
     threads in one process wait for each other longer than they gain.
     """
 
-    def __init__(self, config: TrainConfig, data: Sequence[Path], out: Path, rank: int = 0) -> None:
+    def __init__(
+        self, config: TrainConfig, data: Sequence[Path], out: Path, rank: int = 0, device: str = "cpu"
+    ) -> None:
         self.config, self.data, self.out, self.rank = config, list(data), out, rank
+        self.device = torch.device(device)
+        self.began = time.monotonic()
+        self.finished = False
+        self.ahead = ThreadPoolExecutor(1)
+        self.next: tuple[int, Future[Drawn]] | None = None
         torch.manual_seed(config.seed)
-        self.net = Sweep()
+        self.net = Sweep().to(self.device)
         self.mean = copy.deepcopy(self.net).eval()
         self.optimiser = torch.optim.AdamW(self.net.parameters(), config.rate, weight_decay=1e-4)
         self.step = 0
         self.refresh()
         out.mkdir(parents=True, exist_ok=True)
         if (out / "state.pt").exists():
-            state = torch.load(out / "state.pt", weights_only=True)
+            state = torch.load(out / "state.pt", map_location=self.device, weights_only=True)
             self.net.load_state_dict(state["net"])
             self.mean.load_state_dict(state["mean"])
             self.optimiser.load_state_dict(state["optimiser"])
@@ -184,14 +198,20 @@ class Trainer:
         torch.save(state, self.out / "state.part")
         (self.out / "state.part").replace(self.out / "state.pt")
         info = {"config": json.dumps(self.mean.metadata()), "steps": str(self.step)}
-        tensors = {k: v.contiguous() for k, v in self.mean.state_dict().items()}
+        tensors = {k: v.contiguous().cpu() for k, v in self.mean.state_dict().items()}
         save_file(tensors, self.out / "weights.part", info)
         (self.out / "weights.part").replace(self.out / "weights.safetensors")
+
+    def progress(self, step: int) -> float:
+        """Share of the schedule that is behind a step, by count or by the clock."""
+        c = self.config
+        done = (time.monotonic() - self.began) / (60 * c.minutes) if c.minutes else step / c.steps
+        return min(1.0, done)
 
     def rate(self) -> float:
         """Cosine from the peak to a fiftieth of it, after a linear warm-up."""
         c = self.config
-        t = min(1.0, self.step / c.steps)
+        t = self.progress(self.step)
         return (
             c.rate
             * min(1.0, (self.step + 1) / c.warmup)
@@ -212,14 +232,15 @@ class Trainer:
                     "with python -m training.dataset"
                 )
 
-    def draw(self) -> tuple[tuple[Views, Priors, Tensor], np.random.Generator]:
-        """A sample of this step and process, and the generator that drew it.
+    def draw(self, step: int) -> Drawn:
+        """A sample for a step of this process, and the generator that drew it.
 
         The largest size is drawn from the last folder alone.
         """
         c = self.config
-        rng = np.random.default_rng((c.seed, self.step, self.rank))
-        reached = [s for s in c.sizes if s[0] * c.steps <= self.step]
+        rng = np.random.default_rng((c.seed, step, self.rank))
+        progress = self.progress(step)
+        reached = [s for s in c.sizes if s[0] <= progress]
         _, h, w = reached[-1 if rng.random() < 0.75 else max(-2, -len(reached))]
         newest = (h, w) == tuple(c.sizes[-1][1:]) or rng.random() < c.newest
         folder = self.files[-1] if newest else self.files[rng.integers(len(self.files))]
@@ -229,10 +250,21 @@ class Trainer:
             if sample is not None:
                 return sample, rng
 
+    def drawn(self) -> Drawn:
+        """The sample of this step; on another device than the CPU the next one is prepared meanwhile."""
+        if self.device.type == "cpu":
+            return self.draw(self.step)
+        if self.next is not None and self.next[0] == self.step:
+            (views, priors, depth), rng = self.next[1].result()
+        else:
+            (views, priors, depth), rng = self.draw(self.step)
+        self.next = (self.step + 1, self.ahead.submit(self.draw, self.step + 1))
+        return (views.to(self.device), priors.to(self.device), depth.to(self.device)), rng
+
     def one(self) -> dict[str, float] | None:
         """One optimisation step; None if its gradient was not finite."""
         c = self.config
-        sample, rng = self.draw()
+        sample, rng = self.drawn()
         refined = sorted(rng.choice(len(sample[0]), c.refined, replace=False).tolist())
         for group in self.optimiser.param_groups:
             group["lr"] = self.rate()
@@ -252,15 +284,17 @@ class Trainer:
         return figures
 
     def share(self) -> None:
-        """Average the gradients over the processes."""
+        """Average the gradients over the processes; all stop as soon as one is at the end."""
+        self.finished = self.progress(self.step + 1) >= 1
         if not torch.distributed.is_initialized():
             return
         grads = [p.grad if p.grad is not None else torch.zeros_like(p) for p in self.net.parameters()]
-        flat = torch.cat([g.reshape(-1) for g in grads])
+        end = torch.tensor([float(self.finished)], device=self.device)
+        flat = torch.cat([end, *(g.reshape(-1) for g in grads)]).cpu()
         torch.distributed.all_reduce(flat)
-        flat /= torch.distributed.get_world_size()
-        parts = flat.split([g.numel() for g in grads])
-        for p, g in zip(self.net.parameters(), parts, strict=True):
+        self.finished = bool(flat[0] > 0)
+        flat = flat[1:].to(self.device) / torch.distributed.get_world_size()
+        for p, g in zip(self.net.parameters(), flat.split([g.numel() for g in grads]), strict=True):
             p.grad = g.view_as(p)
 
     @torch.no_grad()
@@ -270,14 +304,16 @@ class Trainer:
         for path in (f for files in self.files for f in files[: self.config.held_out]):
             sample = load(path, 7, (96, 128))
             if sample is not None:
-                rows.append(losses(self.mean, sample, [0, 3], 5)[1])
+                moved = tuple(x.to(self.device) for x in sample)
+                rows.append(losses(self.mean, moved, [0, 3], 5)[1])
         return {k: float(np.mean([r[k] for r in rows])) for k in rows[0]}
 
     def run(self, every: int = 100, validation: int = 500) -> None:
         """Train to the end of the schedule; the first process writes the log and the files."""
         rows: list[dict[str, float]] = []
         start = time.monotonic()
-        while self.step < self.config.steps:
+        self.finished = self.progress(self.step) >= 1
+        while not self.finished:
             figures = self.one()
             self.step += 1
             if figures is not None:
@@ -317,7 +353,7 @@ def work(rank: int, config: TrainConfig, args: argparse.Namespace) -> None:
             "gloo", f"file://{(args.out / 'meeting').resolve()}", rank=rank, world_size=args.workers,
             timeout=timedelta(hours=1),
         )  # fmt: skip
-    trainer = Trainer(config, args.data, args.out, rank)
+    trainer = Trainer(config, args.data, args.out, rank, args.device)
     if args.init is not None:
         trainer.start_from(args.init)
     trainer.run()
@@ -330,13 +366,18 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--steps", type=int, default=TrainConfig.steps)
     parser.add_argument("--rate", type=float, default=TrainConfig.rate)
+    parser.add_argument("--minutes", type=float, default=TrainConfig.minutes)
+    parser.add_argument("--sizes", type=Path, help="JSON of TrainConfig.sizes")
     parser.add_argument("--workers", type=int, default=2, help="processes that share each step")
     parser.add_argument("--threads", type=int, default=1, help="of each process")
+    parser.add_argument("--device", default="cpu", help="cuda: several workers keep one GPU busy")
     parser.add_argument("--init", type=Path, help="weights to start from")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / "meeting").unlink(missing_ok=True)
-    config = TrainConfig(steps=args.steps, rate=args.rate)
+    config = TrainConfig(steps=args.steps, rate=args.rate, minutes=args.minutes)
+    if args.sizes is not None:
+        config = replace(config, sizes=tuple(tuple(s) for s in json.loads(args.sizes.read_text())))
     if args.workers > 1:
         torch.multiprocessing.spawn(work, (config, args), args.workers)
     else:

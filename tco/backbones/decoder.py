@@ -123,7 +123,9 @@ class Refine(nn.Module):
         self.head = nn.Conv2d(n, c.hypotheses + 2, 3, padding=1)
         self.mask = nn.Sequential(Conv(2, n + c.context, 32), Pointwise(32, 36)) if upsample else None
 
-    def forward(self, x: Tensor, context: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor | None]:
+    def forward(
+        self, x: Tensor, context: tuple[Tensor, Tensor, Tensor]
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Features (B, ·, h, w) → scores (B, D, h, w), offset and log-error (B, 2, h, w), mask (B, 36, h, w).
 
         Context is at the resolution of the features, its half and its quarter. The mask is for the last

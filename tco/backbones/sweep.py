@@ -80,7 +80,8 @@ def mixed(device: torch.device) -> torch.autocast:
     Float64 is left alone, so that finite differences can be taken.
     """
     if device.type == "cpu":
-        native = torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
+        probes = (getattr(torch.cpu, name, None) for name in BF16_PROBES)
+        native = any(probe() for probe in probes if probe is not None)
     else:
         native = device.type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
     return torch.autocast(device.type, torch.bfloat16, enabled=native)
@@ -193,9 +194,7 @@ class Sweep(nn.Module):
             stage = self.refine(k, encoded, chosen, stage, world)
             if chosen == tuple(every) and k + 1 < passes:
                 world = stage.detached()
-        return Prediction(
-            1 / stage.inverse, expected_confidence(stage.log_error), encoded.cameras, chosen
-        )
+        return Prediction(1 / stage.inverse, expected_confidence(stage.log_error), encoded.cameras, chosen)
 
     def _others(self, encoded: Encoded, chosen: tuple[int, ...], stage: Stage) -> Stage:
         """Coarse stages of all views at half resolution, those not chosen computed now."""
@@ -287,6 +286,9 @@ class Sweep(nn.Module):
             total, weights = total + weight * corr, weights + weight
         return (total / (weights + 1e-6)).permute(0, 3, 1, 2)
 
+
+BF16_PROBES = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
+"""Functions of ``torch.cpu`` that tell of native bfloat16 products; older versions of torch lack them."""
 
 BATCH = 400_000
 """Cells of correlation volumes that are computed at once: small views together, large ones alone."""

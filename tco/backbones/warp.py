@@ -76,9 +76,7 @@ def correlate_plainly(
     return (out.permute(0, 2, 3, 1, 4), mask.permute(0, 2, 3, 1)) if last else (out, mask)
 
 
-def agree(
-    planes: Tensor, matrices: Tensor, sources: Tensor, inverse: Tensor, log_error: Tensor
-) -> Tensor:
+def agree(planes: Tensor, matrices: Tensor, sources: Tensor, inverse: Tensor, log_error: Tensor) -> Tensor:
     """What other views' depths say of each hypothesis.
 
     Args:
@@ -92,15 +90,13 @@ def agree(
     """
     if planes.device.type != "cpu" or planes.dtype != torch.float32:
         return agree_plainly(planes, matrices, sources, inverse, log_error)
-    from tco.backbones import _warp_kernels as kernels
+    from tco.backbones._warp_kernels import Maps, agreement
 
     b, d, h, w = planes.shape
     out = torch.empty(b, 2 * d, h, w)
-    fixed = (
-        _flat(planes), _flat(matrices), sources.reshape(-1).numpy(), _flat(inverse), _flat(log_error),
-        (h, w, d, sources.shape[1]), out.numpy().reshape(-1),
-    )  # fmt: skip
-    _in_parallel(lambda lo, hi: kernels.agreement(*fixed, lo, hi), b * h)
+    maps = Maps(_flat(matrices), _ints(sources), _flat(inverse), _flat(log_error))
+    shape, flat, result = (h, w, d, sources.shape[1]), _flat(planes), out.numpy().reshape(-1)
+    _in_parallel(lambda *rows: agreement(flat, maps, shape, result, rows), b * h)
     return out
 
 
@@ -133,48 +129,51 @@ class _Correlation(torch.autograd.Function):
     def forward(
         ctx: Any, f: Tensor, pairs: Tensor, matrices: Tensor, planes: Tensor, groups: int, last: bool
     ) -> tuple[Tensor, Tensor]:
-        from tco.backbones._warp_kernels import correlation_kernels
+        from tco.backbones._warp_kernels import forward_kernel
 
         _, h, w, c = f.shape
         b, d = planes.shape[:2]
-        shape, steps = (h, w, d), _steps(planes.shape, (h, w, groups), last)
+        layout = _layout(planes.shape, (h, w, groups), last)
         out = f.new_empty((b, h, w, d, groups) if last else (b, d, h, w, groups))
         seen = f.new_empty(out.shape[:-1])
-        fixed = (_flat(f), _ints(pairs), _flat(matrices), _flat(planes), shape, steps)
-        run = correlation_kernels(c, groups)[0]
+        run, flat, geometry = forward_kernel(c, groups), _flat(f), _geometry(pairs, matrices, planes)
         o, s = out.numpy().reshape(-1), seen.numpy().reshape(-1)
-        _in_parallel(lambda lo, hi: run(*fixed, o, s, lo, hi), b * h)
+        _in_parallel(lambda *rows: run(flat, geometry, layout, o, s, rows), b * h)
         ctx.save_for_backward(f, pairs, matrices, planes)
-        ctx.groups, ctx.shape, ctx.steps = groups, shape, steps
+        ctx.groups, ctx.layout = groups, layout
         ctx.mark_non_differentiable(seen)
         return out, seen
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        from tco.backbones._warp_kernels import correlation_kernels
+        from tco.backbones._warp_kernels import backward_kernel
 
         f, pairs, matrices, planes = ctx.saved_tensors
         h, w, c = f.shape[1:]
         grads = f.new_zeros((len(pairs), 2, h, w, c))
-        fixed = (
-            _flat(f), _ints(pairs), _flat(matrices), _flat(planes), ctx.shape, ctx.steps,
-            _flat(upstream[0]), grads.numpy().reshape(-1),
-        )  # fmt: skip
-        run = correlation_kernels(c, ctx.groups)[1]
-        _in_parallel(lambda lo, hi: run(*fixed, lo, hi), len(pairs))
+        run, flat, geometry = backward_kernel(c, ctx.groups), _flat(f), _geometry(pairs, matrices, planes)
+        up, into = _flat(upstream[0]), grads.numpy().reshape(-1)
+        _in_parallel(lambda *rows: run(flat, geometry, ctx.layout, up, into, rows), len(pairs))
         total = torch.zeros_like(f)
-        total.index_add_(0, pairs.reshape(-1).long(), grads.flatten(0, 1))
+        total.index_add_(0, pairs.reshape(-1), grads.flatten(0, 1))
         return total, None, None, None, None, None
 
 
-def _steps(planes: torch.Size, size: tuple[int, int, int], last: bool) -> tuple[int, ...]:
-    """Distances between neighbours in the flat planes and in the flat output: pair, plane, row, column."""
+def _layout(planes: torch.Size, size: tuple[int, int, int], last: bool) -> Any:
+    """Sizes and distances between neighbours, as the compiled loops want them."""
+    from tco.backbones._warp_kernels import Layout
+
     h, w, g = size
     d = planes[1]
-    per_pixel = planes[2] > 1
-    before = (d * h * w, h * w, w, 1) if per_pixel else (d, 1, 0, 0)
+    before = (d * h * w, h * w, w, 1) if planes[2] > 1 else (d, 1, 0, 0)
     after = (h * w * d * g, g, w * d * g, d * g) if last else (d * h * w * g, h * w * g, w * g, g)
-    return (*before, *after)
+    return Layout(h, w, d, *before, *after)
+
+
+def _geometry(pairs: Tensor, matrices: Tensor, planes: Tensor) -> Any:
+    from tco.backbones._warp_kernels import Geometry
+
+    return Geometry(_ints(pairs), _flat(matrices), _flat(planes))
 
 
 def _flat(x: Tensor) -> Any:

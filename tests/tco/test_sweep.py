@@ -13,8 +13,8 @@ from torch import Tensor
 from tco.backbones import sweep
 from tco.backbones.base import Backbone
 from tco.backbones.decoder import SweepConfig, convex_upsample, soft_argmax
-from tco.backbones.sweep import Encoded, Stage, Sweep, expected_confidence
 from tco.backbones.layers import normalised
+from tco.backbones.sweep import Encoded, Sweep, expected_confidence
 from tco.backbones.sweeping import interpolate_points, relative_cameras
 from tco.backbones.warp import correlate
 from tco.backbones.weights import EMBEDDED, load_sweep

@@ -164,9 +164,7 @@ def test_correlations_of_a_wall_peak_at_its_plane(right: int, dtype: torch.dtype
         assert everywhere.float().mean() > 0.3
         best, where = corr.mean(-1)[0, :, everywhere].max(0)
         assert bool((where == right).all())
-        torch.testing.assert_close(
-            best, torch.full_like(best, 1 / features.shape[1]), rtol=1e-4, atol=1e-6
-        )
+        torch.testing.assert_close(best, torch.full_like(best, 1 / features.shape[1]), rtol=1e-4, atol=1e-6)
 
 
 def test_correlations_are_means_of_products_within_groups() -> None:
