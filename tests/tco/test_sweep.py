@@ -52,8 +52,8 @@ def full(network: Sweep, encoded: Encoded) -> Prediction:
         return network.decode(encoded)
 
 
-def assert_mostly_equal(a: Tensor, b: Tensor, tolerance: float = 1e-3, share: float = 0.99) -> None:
-    """Equal but for pixels in which rounding decides between two planes that are equally good."""
+def assert_mostly_equal(a: Tensor, b: Tensor, tolerance: float = 3e-3, share: float = 0.97) -> None:
+    """Equal to the rounding of bfloat16, but for pixels in which it decides between two equal planes."""
     assert ((a / b - 1).abs() < tolerance).float().mean() > share
 
 
