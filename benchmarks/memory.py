@@ -4,8 +4,9 @@
 ``colmap_tco/_footprints.py``. ``--networks sweep`` measures that one alone and keeps the others' fits.
 
 Every measurement is a process of its own that runs densify's own stage on a made-up workspace, without
-reading weights: memory does not depend on their values. On the CPU the peak is that of the resident memory,
-on CUDA that of PyTorch's allocator.
+reading weights: memory does not depend on their values. On the CPU the peak is that of the resident memory
+once the network is there, on CUDA that of PyTorch's allocator. Published networks are measured with the
+matrix products in the type that ``--dtype`` names, which a CPU without bfloat16 would run in float32.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ ROOT = Path(__file__).resolve().parents[1]
 TABLE = ROOT / "colmap_tco" / "_footprints.py"
 SIZES = {
     "sweep": ((4, 128, 96), (10, 128, 96), (4, 256, 192), (12, 256, 192), (4, 512, 384), (9, 512, 384)),
-    "vggt": ((2, 126, 98), (4, 126, 98), (2, 252, 196), (4, 252, 196)),
-    "pi3": ((2, 126, 98), (4, 126, 98), (2, 252, 196), (4, 252, 196)),
+    "vggt": ((2, 112, 84), (5, 112, 84), (2, 196, 140), (4, 196, 140)),
+    "pi3": ((2, 112, 84), (5, 112, 84), (2, 196, 140), (4, 196, 140)),
 }
 """(views, width, height) that are measured by default."""
 MODES = {"forward": 0, "optimised": 2}
@@ -51,13 +52,15 @@ def main() -> None:
     )
     parser.add_argument("--networks", nargs="+", default=["sweep"], choices=list(SIZES))
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--dtype", default="bfloat16", choices=["bfloat16", "float32"])
     parser.add_argument("--write", action="store_true", help="put the fits into colmap_tco/_footprints.py")
     parser.add_argument("--one", nargs=5, metavar=("NETWORK", "VIEWS", "WIDTH", "HEIGHT", "STEPS"))
     options = parser.parse_args()
     if options.one:
         network, *numbers = options.one
         views, width, height, steps = map(int, numbers)
-        print(json.dumps(measured_here(network, options.device, (views, width, height), steps)))
+        place = (options.device, options.dtype)
+        print(json.dumps(measured_here(network, place, (views, width, height), steps)))
         return
     from colmap_tco import _footprints
 
@@ -67,11 +70,12 @@ def main() -> None:
     )
     for network in options.networks:
         for mode, steps in MODES.items():
-            peaks, process = series(network, options.device, steps)
+            peaks, process = series(network, (options.device, options.dtype), steps)
             fit = fitted(peaks)
-            fits[network, options.device, mode] = fit
+            where = options.device if network == "sweep" else f"{options.device}:{options.dtype}"
+            fits[network, where, mode] = fit
             for peak, size in zip(peaks, SIZES[network], strict=True):
-                row = (network, options.device, mode, str(peak.views), f"{size[1]}×{size[2]}")
+                row = (network, where, mode, str(peak.views), f"{size[1]}×{size[2]}")
                 guess = predicted(fit, peak)
                 cells = (f"{peak.bytes / 1e6:.0f}", f"{guess / 1e6:.0f}", f"{guess / peak.bytes - 1:+.1%}")
                 print("| " + " | ".join(row + cells) + " |", flush=True)
@@ -79,12 +83,13 @@ def main() -> None:
         TABLE.write_text(source(process, fits))
 
 
-def series(network: str, device: str, steps: int) -> tuple[list[Peak], float]:
+def series(network: str, place: tuple[str, str], steps: int) -> tuple[list[Peak], float]:
     """Peaks at all sizes, each of a process of its own, and the bytes of a process without a network."""
     peaks, process = [], 0.0
     for views, width, height in SIZES[network]:
         words = [network, *map(str, (views, width, height, steps))]
-        command = [sys.executable, "-m", "benchmarks.memory", "--device", device, "--one", *words]
+        options = ["--device", place[0], "--dtype", place[1], "--one", *words]
+        command = [sys.executable, "-m", "benchmarks.memory", *options]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
         if done.returncode:
             sys.exit(f"{' '.join(command)} failed:\n{done.stderr}")
@@ -130,35 +135,46 @@ def source(process: float, fits: dict[tuple[str, str, str], tuple[float, float, 
     return "\n".join(lines) + "\n"
 
 
-def measured_here(network: str, device: str, size: tuple[int, int, int], steps: int) -> dict[str, Any]:
+def measured_here(
+    network: str, place: tuple[str, str], size: tuple[int, int, int], steps: int
+) -> dict[str, Any]:
     """Peak of this process, which must do nothing else."""
     import torch
 
     from colmap_tco.memory import canvas_pixels
 
+    device = torch.device(place[0])
     with tempfile.TemporaryDirectory() as folder:
         tracks, views = chunk(Path(folder), size)
-        process = resident_peak()
-        backbone = made(network, torch.device(device))
-        run(backbone, tracks, views, torch.device(device), steps)
-    peak = torch.cuda.max_memory_allocated() if device.startswith("cuda") else resident_peak()
+        process = resident("VmRSS")
+        backbone = made(network, device, getattr(torch, place[1]))
+        forget_peak()
+        run(backbone, tracks, views, device, steps)
+    peak = torch.cuda.max_memory_allocated() if device.type == "cuda" else resident("VmHWM")
     return {"views": len(views), "pixels": canvas_pixels(views), "bytes": peak, "process": process}
 
 
-def resident_peak() -> int:
-    """Largest resident memory of this process so far, bytes."""
-    import resource
+def resident(what: str) -> int:
+    """Resident memory of this process, bytes: VmRSS now, VmHWM its peak. Linux alone tells it."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(f"{what}:"):
+            return 1024 * int(line.split()[1])
+    raise ValueError(f"/proc/self/status has no {what}")
 
-    unit = 1 if sys.platform == "darwin" else 1024
-    return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+def forget_peak() -> None:
+    """Let the peak start from what is resident now: building a network takes more than it then holds."""
+    import gc
+
+    gc.collect()
+    Path("/proc/self/clear_refs").write_text("5")
 
 
-def made(network: str, device: Any) -> Any:
-    """A network of the published size, with whatever its weights are at first."""
+def made(network: str, device: Any, dtype: Any) -> Any:
+    """A network of the published size, with weights that do no harm."""
     import torch
 
     from tco.backbones import pi3, vggt
-    from tco.backbones.transformer import compute_dtype
     from tco.backbones.weights import load_sweep
 
     if network == "sweep":
@@ -173,7 +189,7 @@ def made(network: str, device: Any) -> Any:
     with torch.no_grad():
         for name, tensor in inner.state_dict(keep_vars=True).items():
             tensor.fill_(1e-3 if name.endswith("weight") else 0.0)
-    return wrap(inner, compute_dtype(device)).eval().requires_grad_(False).to(device)
+    return wrap(inner, dtype).eval().requires_grad_(False).to(device)
 
 
 def chunk(folder: Path, size: tuple[int, int, int]) -> tuple[Any, list[Any]]:

@@ -178,7 +178,7 @@ def _best(device: torch.device) -> tuple[Network, str]:
     ready = [name for name in PUBLISHED if cached(PUBLISHED[name][1]) and accepted(NETWORKS[name])]
     sweep = NETWORKS["sweep"]
     if not ready:
-        return sweep, f"auto: no weights of {' or '.join(PUBLISHED)} were fetched"
+        return sweep, f"auto: no weights of {' or '.join(PUBLISHED)} were fetched with their licence accepted"
     if device.type != "cuda":
         return sweep, (
             f"auto: {' and '.join(ready)} could run, but take long without a CUDA device; "

@@ -58,15 +58,29 @@ def footprint(network: str, device: str, steps: int) -> Footprint:
         network: its name.
         device: ``cpu``, ``cuda``, …. Where a network was not measured on it, it is taken to need there what
             it needs on the CPU, less the process, which is not in the device's memory.
+            The type in which a device multiplies matrices counts: bfloat16 takes half of float32.
         steps: of optimisation; 0 takes less.
     """
     kind = network.removesuffix("-commercial")
-    mode = "optimised" if steps else "forward"
-    fits = _footprints.FITS
-    if (kind, device, mode) in fits:
-        return Footprint(*fits[kind, device, mode], measured=device)
-    fixed, per_view, per_step = fits[kind, "cpu", mode]
-    return Footprint(max(0.0, fixed - _footprints.PROCESS), per_view, per_step, measured="")
+    mode, dtype, fits = "optimised" if steps else "forward", _products(device), _footprints.FITS
+    for place in (f"{device}:{dtype}", device):
+        if (kind, place, mode) in fits:
+            return Footprint(*fits[kind, place, mode], measured=place)
+    place = next(p for p in (f"cpu:{dtype}", "cpu:bfloat16", "cpu") if (kind, p, mode) in fits)
+    fixed, per_view, per_step = fits[kind, place, mode]
+    process = 0.0 if device == "cpu" else _footprints.PROCESS
+    return Footprint(max(0.0, fixed - process), per_view, per_step, measured="")
+
+
+def _products(device: str) -> str:
+    """The type in which published networks multiply matrices on a kind of device."""
+    import torch
+
+    from tco.backbones.transformer import compute_dtype
+
+    if device == "cuda" and not torch.cuda.is_available():
+        return "bfloat16"  # as on all cards since 2020
+    return str(compute_dtype(torch.device(device))).removeprefix("torch.")
 
 
 def chunk_limit(needs: Footprint, pixels: int, free: int) -> int:

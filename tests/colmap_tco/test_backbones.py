@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 import torch
 
-from colmap_tco.backbones import NetworkConfig, Selected, choose_device, load, select, suited
+from colmap_tco.backbones import NetworkConfig, Selected, _best, choose_device, load, select, suited
 from colmap_tco.errors import MissingError
 from colmap_tco.published import NETWORKS, PUBLISHED
+from colmap_tco.weights import _note_accepted, cached
 from tco.backbones.base import Backbone
 from tco.backbones.checkpoints import save
 from tco.backbones.dinov2 import ViTConfig
@@ -71,7 +73,7 @@ def test_weights_that_are_missing_or_foreign_are_an_error(tmp_path: Path, backbo
 def test_the_network_in_the_package_needs_nothing_and_is_frozen() -> None:
     chosen = select(NetworkConfig(device="cpu"))
     assert chosen.network.name == "sweep" and chosen.weights == EMBEDDED
-    assert "no weights of vggt or vggt-commercial or pi3 were fetched" in chosen.reason
+    assert "no weights of vggt or vggt-commercial or pi3 were fetched with their lic" in chosen.reason
     network = load(chosen)
     assert isinstance(network, torch.nn.Module) and not network.training
     assert not any(p.requires_grad for p in network.parameters())
@@ -82,6 +84,31 @@ def test_the_network_in_the_package_needs_nothing_and_is_frozen() -> None:
 def test_a_network_that_was_not_fetched_says_how_to(name: str) -> None:
     with pytest.raises(MissingError, match=f"'colmap-tco weights fetch {name}' .* --weights"):
         select(NetworkConfig(backbone=name, device="cpu"))
+
+
+def fetched(folder: Path, name: str) -> Path:
+    """A file of the published size, empty but for its length, where the hub's cache would have it."""
+    c = PUBLISHED[name][1]
+    path = folder / "hub" / f"models--{c.repository.replace('/', '--')}" / "snapshots" / c.revision / c.file
+    path.parent.mkdir(parents=True)
+    path.touch()
+    os.truncate(path, c.size)
+    return path
+
+
+def test_auto_needs_an_accepted_licence_and_a_fast_device(tmp_path: Path) -> None:
+    """What another program fetched is not used unasked; and without CUDA the package's network is better."""
+    cpu = torch.device("cpu")
+    path = fetched(tmp_path, "pi3")
+    assert cached(PUBLISHED["pi3"][1]) == path
+    network, reason = _best(cpu)
+    assert network.name == "sweep" and "were fetched" in reason
+    _note_accepted(*PUBLISHED["pi3"])
+    network, reason = _best(cpu)
+    assert network.name == "sweep"
+    assert "pi3 could run, but take long without a CUDA device; --backbone pi3 runs it" in reason
+    os.truncate(path, 1000)
+    assert cached(PUBLISHED["pi3"][1]) is None and "were fetched" in _best(cpu)[1]
 
 
 @pytest.mark.parametrize("kind", TINY)
