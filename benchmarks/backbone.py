@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import resource
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -183,7 +183,8 @@ def row(backbone: Any, name: str, kind: str, count: int, options: argparse.Names
     return f"| {cells} |"
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the table that the command line asks for."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -198,7 +199,7 @@ def main() -> None:
     parser.add_argument("--cpu-time", action="store_true", help="CPU time of this process, for one thread")
     parser.add_argument("--small", action="store_true", help="networks of a few layers, to try the script")
     parser.add_argument("--recompute", action="store_true", help="recompute all activations in the step")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     if options.cpu_time and (options.threads != 1 or options.device != "cpu"):
         parser.error("--cpu-time goes with --device cpu --threads 1")
     torch.set_num_threads(options.threads)

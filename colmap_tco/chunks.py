@@ -75,10 +75,26 @@ def plan_chunks(common: Ints, max_views: int) -> ChunkPlan:
         elif len(members) <= max_views:
             chunks.append(Chunk(tuple(members)))
         else:
-            room = max_views - max(1, round(max_views * CONTEXT_SHARE))
-            for group in _merge(_grow(common, members, room), common, (room + max_views) // 2):
-                chunks.append(Chunk(tuple(sorted(group)), _context(common, group, max_views)))
+            chunks += _cut(common, members, max_views)
     return ChunkPlan(tuple(sorted(chunks, key=lambda chunk: chunk.owned)), skipped)
+
+
+def smaller(chunk: Chunk, common: Ints, max_views: int) -> list[Chunk]:
+    """The views that a chunk owns in chunks of at most ``max_views``, context included.
+
+    Args:
+        chunk: one that does not fit the memory.
+        common: (V, V) as for :func:`plan_chunks`.
+        max_views: at least 2.
+    """
+    return _cut(common, list(chunk.owned), max_views)
+
+
+def _cut(common: Ints, members: list[int], max_views: int) -> list[Chunk]:
+    """Chunks of at most ``max_views``, context included, that own these views."""
+    room = max_views - max(1, round(max_views * CONTEXT_SHARE))
+    groups = _merge(_grow(common, members, room), common, (room + max_views) // 2)
+    return [Chunk(tuple(sorted(group)), _context(common, group, max_views)) for group in groups]
 
 
 def _components(linked: Mask) -> list[list[int]]:

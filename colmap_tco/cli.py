@@ -18,7 +18,7 @@ from types import FrameType, TracebackType
 from typing import Any, NamedTuple, NoReturn, Protocol
 
 from colmap_tco import flags
-from colmap_tco.errors import DensifyError, OutOfMemoryError
+from colmap_tco.errors import DensifyError, OutOfMemoryError, is_out_of_memory
 from colmap_tco.progress import Progress
 
 logger = logging.getLogger(__name__)
@@ -84,6 +84,11 @@ COMMANDS: dict[str, Command] = {
         "colmap_tco.densify:DensifyConfig",
         "colmap_tco.densify:densify",
     ),
+    "check": Command(
+        "show what this machine has, what each network would need, and which one would run",
+        "colmap_tco.check:CheckConfig",
+        "colmap_tco.check:check",
+    ),
     "weights": Command(
         "list, fetch, find and verify the weights of published networks",
         "colmap_tco.weights:WeightsConfig",
@@ -147,20 +152,6 @@ def exit_code(error: BaseException) -> int:
     if isinstance(error, KeyboardInterrupt):
         return INTERRUPTED
     return OutOfMemoryError.exit_code if is_out_of_memory(error) else 1
-
-
-def is_out_of_memory(error: BaseException) -> bool:
-    """Whether ``error`` is one of the ways in which Python, numpy, torch and OpenCV run out of memory.
-
-    Torch is not imported to find out: its CUDA error is known by its name, and its CPU allocator and
-    OpenCV raise general errors that only their texts tell apart.
-    """
-    if isinstance(error, MemoryError):
-        return True
-    if any(cls.__name__ == "OutOfMemoryError" for cls in type(error).__mro__):
-        return True
-    text = str(error)
-    return "can't allocate memory" in text or "Insufficient memory" in text
 
 
 def configure_logging(verbosity: int, log_json: bool) -> None:

@@ -8,31 +8,25 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
-import platform
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
-from colmap_tco import _pycolmap, outputs
-from colmap_tco.chunks import ChunkPlan, plan_chunks, source_views
-from colmap_tco.errors import InputError, PartlyDoneError
-from colmap_tco.fusion import FusionConfig, fuse
+from colmap_tco import outputs, report
+from colmap_tco.attempts import within_memory
+from colmap_tco.backbones import Budget, NetworkConfig, Selected, load, select, suited
+from colmap_tco.chunks import Chunk, ChunkPlan, plan_chunks, source_views
+from colmap_tco.errors import InputError, OutOfMemoryError, PartlyDoneError
+from colmap_tco.fusion import EmptyCloudError, FusionConfig, fuse
 from colmap_tco.lock import locked
 from colmap_tco.mapping import MappingConfig, ensure_model
-from colmap_tco.predict import (
-    NetworkConfig,
-    chunk_limit,
-    free_memory,
-    load_network,
-    predict_chunk,
-    weights_file,
-)
+from colmap_tco.memory import release
+from colmap_tco.predict import ChunkResult, predict_chunk
 from colmap_tco.priors import PriorConfig, with_points
 from colmap_tco.progress import Progress
 from colmap_tco.resume import Result, fingerprint, open_result
@@ -76,6 +70,21 @@ class Densified:
     report: Mapping[str, Any]
     fresh: bool
 
+    def doubts(self) -> list[str]:
+        """What keeps the result from being complete and good, a sentence each."""
+        images, held = self.report["images"], self.report["held_out"]
+        left, told = images["skipped"] + images["failed"], []
+        if left:
+            told.append(f"{left} images were left out; report.json says why of each")
+        if not held["plausible"]:
+            told.append(
+                f"the depths contradict COLMAP's points (median error {100 * held['error']:.0f} %, where one "
+                f"depth for each view would have {100 * held['error_of_one_depth']:.0f} %): do not use them"
+            )
+        if self.report["no_points"]:
+            told.append(self.report["no_points"])
+        return told
+
     def summary(self) -> str:
         """What the user wants to know at the end."""
         r, held = self.report, self.report["held_out"]
@@ -101,15 +110,15 @@ def densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified:
         InputError: images, model or masks that cannot be used, a result with other settings is there, or
             another run is working on the workspace.
         MissingError: no such device or weights.
-        PartlyDoneError: everything was written, but some views had to be left out; also where an earlier
-            run with these settings did so.
+        PartlyDoneError: everything was written, but some views had to be left out, or the depths contradict
+            the points of the model; also where an earlier run with these settings found so.
     """
     root = existing_root(root)
     with locked(root):
         done = _densify(root, config, progress)
-    left = done.report["images"]["skipped"]
-    if left:
-        raise PartlyDoneError(f"{done.summary()}\n{left} images were left out; report.json says why of each")
+    doubts = done.doubts()
+    if doubts:
+        raise PartlyDoneError("\n".join([done.summary(), *doubts]))
     return done
 
 
@@ -119,41 +128,55 @@ def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified
     progress.plan(STAGES)
     with clock("workspace"):
         progress.stage("workspace", 1)
-        backbone, device = load_network(config.network)
+        chosen = select(config.network)
+        config = dataclasses.replace(config, tco=suited(config.tco, chosen.network))
         workspace = _open_or_map(root, config)
-        views, skipped = make_views(workspace, config.views, backbone.stride)
+        views, skipped = make_views(workspace, config.views, chosen.network.stride, chosen.network.image_size)
         tracks = read_tracks(workspace.model)
         views, blind = with_points(tracks, views, config.priors, config.seed)
         pairs = covisibility(tracks, [view.image_id for view in views])
-        plan = plan_chunks(pairs.common, chunk_limit(views, config.network, free_memory()))
-        key, maps = _fingerprints(workspace, views, config)
+        budget = Budget.of(chosen, views, config.network, config.tco.steps)
+        plan = plan_chunks(pairs.common, budget.views())
+        key, maps = _fingerprints(workspace, views, config, chosen)
         result = open_result(root, key, config.overwrite, maps)
     if result.finished:
         return Densified(result.paths.root, json.loads(result.paths.report.read_text("utf-8")), fresh=False)
     alone = {views[i].name: why for i, why in plan.skipped.items()}
     skipped = {**workspace.skipped, **skipped, **blind, **alone}
     with clock("optimisation"), _threads(config.num_threads):
-        _predict(result, tracks, views, plan, config, (backbone, device), progress)
+        failed = _predict(result, tracks, views, pairs, plan, config, (chosen, budget), progress)
     used = _used(result, views, config.refine_cameras)
     if not used:
-        raise InputError(f"no view could be used: {outputs.plain(skipped)}")
+        _nothing_used(skipped, failed)
     with clock("fusion"):
-        report = _fuse_and_write(result, workspace, used, pairs, views, config, progress)
-    report |= {
-        "views": _view_table(result, used, skipped, workspace.unregistered),
-        "images": {"used": len(used), "skipped": len(skipped), "unregistered": len(workspace.unregistered)},
-        "held_out": _held_out(result),
+        figures = _fuse_and_write(result, workspace, used, pairs, views, config, progress)
+    figures |= {
+        "views": report.view_table(
+            result, used, {"skipped": skipped, "failed": failed, "unregistered": workspace.unregistered}
+        ),
+        "images": {
+            "used": len(used),
+            "skipped": len(skipped),
+            "failed": len(failed),
+            "unregistered": len(workspace.unregistered),
+        },
+        "backbone": chosen.describe(),
+        "chunks": [{k: v for k, v in chunk.items() if k != "loss"} for chunk in result.chunks],
+        "held_out": report.held_out(result),
         "loss": [chunk["loss"] for chunk in result.chunks],
         "workspace": {"model": workspace.model_path, "reasons": workspace.reasons},
         "settings": config,
-        "versions": _versions(),
-        "device": str(device),
+        "versions": report.versions(),
+        "device": str(chosen.device),
         "seconds": clock.seconds,
     }
-    outputs.write_report(result.paths.report, report)
+    outputs.write_report(result.paths.report, figures)
     folder = result.publish().root
     return Densified(folder, json.loads((folder / "report.json").read_text("utf-8")), fresh=True)
 
+
+HASHED = 200_000_000
+"""Bytes below which a file of weights counts by its content, above by its size and time of change."""
 
 STAGES = {"workspace": 2.0, "optimisation": 80.0, "fusion": 18.0}
 """Stages of a run and about how much of its time each takes."""
@@ -193,7 +216,9 @@ def _open_or_map(root: Path, config: DensifyConfig) -> Workspace:
     return open_workspace(root, config.workspace, config.num_threads)
 
 
-def _fingerprints(workspace: Workspace, views: Sequence[View], config: DensifyConfig) -> tuple[str, str]:
+def _fingerprints(
+    workspace: Workspace, views: Sequence[View], config: DensifyConfig, chosen: Selected
+) -> tuple[str, str]:
     """Two texts: one changes with everything that decides the result, one with what decides the maps."""
     kept = dataclasses.replace(
         config, overwrite=False, fusion=dataclasses.replace(config.fusion, num_threads=-1)
@@ -201,43 +226,85 @@ def _fingerprints(workspace: Workspace, views: Sequence[View], config: DensifyCo
     mapped = dataclasses.replace(kept, refine_cameras=False, fusion=FusionConfig())
     masks = [view.mask_path for view in views if view.mask_path is not None]
     model = [path for path in workspace.model_path.iterdir() if path.suffix in (".bin", ".txt")]
-    contents = [*model, *masks, weights_file(config.network)]
+    contents, told = [*model, *masks], {"versions": report.versions(), "network": chosen.network.name}
+    status = chosen.weights.stat()
+    if status.st_size < HASHED:
+        contents.append(chosen.weights)
+    else:
+        told["weights"] = f"{chosen.weights.name} {status.st_size} {status.st_mtime_ns}"
     pictures = [view.path for view in views]
 
     def key(settings: DensifyConfig) -> str:
-        told = {"settings": outputs.plain(settings), "versions": _versions()}
-        return fingerprint(told, contents, pictures)
+        return fingerprint({"settings": outputs.plain(settings), **told}, contents, pictures)
 
     return key(kept), key(mapped)
 
 
 def _predict(
-    result: Result, tracks: Tracks, views: Sequence[View], plan: ChunkPlan, config: DensifyConfig,
-    network: Any, progress: Progress,
-) -> None:  # fmt: skip
-    """Optimise the chunks that are not finished yet and write the maps of their views."""
+    result: Result, tracks: Tracks, views: Sequence[View], pairs: Covisibility, plan: ChunkPlan,
+    config: DensifyConfig, run: tuple[Selected, Budget], progress: Progress,
+) -> dict[str, str]:  # fmt: skip
+    """Optimise the chunks that are not finished yet and write the maps of their views.
+
+    Returns:
+        Name → why a view could not be predicted.
+    """
+    chosen, budget = run
     todo = [c for c in plan.chunks if not all(result.is_done(views[i].name) for i in c.owned)]
     progress.stage("optimisation", sum(config.tco.steps + len(c.owned) for c in todo))
-    for chunk in todo:
+    if not todo:
+        return {}
+    backbone, failed = load(chosen), {}
+
+    def work(chunk: Chunk) -> ChunkResult:
         settings = (config.priors, config.tco, config.seed)
-        done = predict_chunk(
-            network, tracks, views, chunk, settings, lambda terms: progress.advance(1, loss=terms["loss"])
-        )
-        for view in (views[i] for i in chunk.owned):
-            r = done.views[view.name]
-            outputs.write_view(result.paths, view, r.maps)
-            camera = r.corrected.camera
-            # Rounded like the figures of the report, a camera in map coordinates would be metres off.
-            exact = {
-                "cam_from_world": r.corrected.cam_from_world.tolist(),
-                "focal": [camera.fx, camera.fy],
+        return predict_chunk(
+            (backbone, chosen.device), tracks, views, chunk, settings,
+            lambda terms: progress.advance(1, loss=terms["loss"]),
+        )  # fmt: skip
+
+    for attempt in within_memory(todo, pairs.common, work, budget.views_now, lambda: release(chosen.device)):
+        owned = [views[i] for i in attempt.chunk.owned]
+        if attempt.result is None:
+            failed.update({view.name: attempt.why for view in owned})
+            continue
+        _write_chunk(result, owned, attempt.result, progress)
+        result.mark_chunk(
+            {
+                "views": [views[i].name for i in attempt.chunk.views],
+                "owned": len(owned),
+                "reduced": attempt.chunk not in plan.chunks,
+                "agreement": attempt.result.agreement,
+                "loss": outputs.plain(attempt.result.history),
             }
-            figures: Any = outputs.plain(r.figures)
-            result.mark_done(view.name, {**figures, **exact})
-            progress.advance(1)
-        names = [views[i].name for i in chunk.owned]
-        loss: Any = outputs.plain(done.history)
-        result.mark_chunk({"views": names, "loss": loss})
+        )
+    return failed
+
+
+def _write_chunk(result: Result, owned: Sequence[View], done: ChunkResult, progress: Progress) -> None:
+    """Write the maps of a chunk's own views, and record them as done."""
+    for view in owned:
+        r = done.views[view.name]
+        outputs.write_view(result.paths, view, r.maps)
+        camera = r.corrected.camera
+        # Rounded like the figures of the report, a camera in map coordinates would be metres off.
+        exact = {
+            "cam_from_world": r.corrected.cam_from_world.tolist(),
+            "focal": [camera.fx, camera.fy],
+        }
+        figures: Any = outputs.plain(r.figures)
+        result.mark_done(view.name, {**figures, **exact})
+        progress.advance(1)
+
+
+def _nothing_used(skipped: Mapping[str, str], failed: Mapping[str, str]) -> NoReturn:
+    """Say why there is no result at all."""
+    if failed:
+        raise OutOfMemoryError(
+            f"not even two views fit the memory: {next(iter(failed.values()))}; smaller images "
+            "(--max_image_size) or a smaller network (--backbone sweep) need less"
+        )
+    raise InputError(f"no view could be used: {outputs.plain(skipped)}")
 
 
 def _used(result: Result, views: Sequence[View], refine: bool) -> list[View]:
@@ -269,42 +336,11 @@ def _fuse_and_write(
     model = outputs.undistorted_model(workspace.model, used, originals)
     indices = outputs.write_model(result.paths, model)
     outputs.write_lists(result.paths, {view.name: neighbours[view.name] for view in used})
-    cloud, report = fuse(outputs.fusion_views(result.paths, used, neighbours, indices), config.fusion)
+    why = None
+    try:
+        cloud, fused = fuse(outputs.fusion_views(result.paths, used, neighbours, indices), config.fusion)
+    except EmptyCloudError as error:  # the depth maps are there all the same
+        cloud, fused, why = error.cloud, error.report, str(error)
     outputs.write_cloud(result.paths, cloud)
     progress.advance(1)
-    return {"points": len(cloud), "fusion": report.as_dict()}
-
-
-def _view_table(
-    result: Result, used: Sequence[View], skipped: Mapping[str, str], unregistered: Mapping[str, str]
-) -> dict[str, Any]:
-    """Every image: used with its figures, or why not."""
-    table: dict[str, Any] = {v.name: {"state": "used", **result.views[v.name]} for v in used}
-    table.update({name: {"state": "skipped", "why": why} for name, why in skipped.items()})
-    table.update({name: {"state": "unregistered", "why": why} for name, why in unregistered.items()})
-    return dict(sorted(table.items()))
-
-
-def _held_out(result: Result) -> dict[str, Any]:
-    """The user's quality figure: errors at points that neither network nor optimisation saw."""
-    rows: list[Any] = [v for v in result.views.values() if v["points_held_out"]]
-    count = sum(r["points_held_out"] for r in rows)
-    if not count:
-        return {"points": 0, "median_error": None, "within_5_percent": None}
-    share = sum(r["held_out_within_5_percent"] * r["points_held_out"] for r in rows) / count
-    return {
-        "points": count,
-        "median_error": float(np.median([r["error_at_held_out"] for r in rows])),
-        "within_5_percent": share,
-    }
-
-
-def _versions() -> dict[str, str]:
-    """Versions of everything that can change the result."""
-    found = {"python": platform.python_version(), "pycolmap": ".".join(map(str, _pycolmap.version()))}
-    for name in ("colmap-tco", "torch", "numpy", "opencv-python-headless", "numba"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed as a package"
-    return found
+    return {"points": len(cloud), "no_points": why, "fusion": fused.as_dict()}

@@ -34,3 +34,17 @@ class PartlyDoneError(DensifyError):
     """Some views failed; the others were written."""
 
     exit_code = 6
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether ``error`` is one of the ways in which Python, numpy, torch and OpenCV run out of memory.
+
+    Torch is not imported to find out: its CUDA error is known by its name, and its CPU allocator and
+    OpenCV raise general errors that only their texts tell apart.
+    """
+    if isinstance(error, MemoryError):
+        return True
+    if any(cls.__name__ == "OutOfMemoryError" for cls in type(error).__mro__):
+        return True
+    text = str(error)
+    return "can't allocate memory" in text or "Insufficient memory" in text

@@ -142,17 +142,30 @@ class FusionView:
     load: Callable[[], FusionMaps]
 
 
+class EmptyCloudError(DensifyError):
+    """Fusion left no point.
+
+    Attributes:
+        cloud: of no points.
+        report: what removed them.
+    """
+
+    def __init__(self, cloud: Cloud, report: FusionReport) -> None:
+        super().__init__(why_empty(report))
+        self.cloud, self.report = cloud, report
+
+
 def fuse(views: Sequence[FusionView], config: FusionConfig | None = None) -> tuple[Cloud, FusionReport]:
     """Fuse all views into one cloud; see :func:`fuse_views`.
 
     Raises:
-        DensifyError: no point is left; the message names the filter that removed most.
+        EmptyCloudError: no point is left; the message names the filter that removed most.
     """
     config = config or FusionConfig()
     report = FusionReport()
     cloud = join(fuse_views(views, config, report))
     if not len(cloud):
-        raise DensifyError(why_empty(report))
+        raise EmptyCloudError(cloud, report)
     if report.lowered:
         log.info("%d of %d points are confirmed by fewer than min_num_pixels=%d views, for no more see them",
                  report.lowered, len(cloud), config.min_num_pixels)  # fmt: skip

@@ -3,45 +3,28 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from colmap_tco.chunks import Chunk
-from colmap_tco.errors import MissingError
 from colmap_tco.normals import normals_from_depth
 from colmap_tco.outputs import ViewMaps
 from colmap_tco.priors import PriorConfig, build_priors, check_projection, chunk_frame
 from colmap_tco.tracks import Tracks
-from colmap_tco.views import View, batch, canvas_size, crop
-from tco.config import knob
+from colmap_tco.views import View, batch, crop
 from tco.options import TCOConfig
 
 if TYPE_CHECKING:
     import torch
 
-    from tco.backbones.sweep import Sweep
+    from tco.backbones.base import Backbone
     from tco.optimize import Outcome
     from tco.types import Cameras, Prediction
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class NetworkConfig:
-    """The network, and where it runs."""
-
-    weights: str = knob("", "file of weights (safetensors) to use instead of those in the package")
-    device: str = knob(
-        "auto", "auto: cuda if there is one, else cpu; or any name that torch knows, such as cuda:1"
-    )
-    chunk_size: int = knob(
-        0, "views that are optimised together; 0: as many as fit half of the free memory, at most 40"
-    )
 
 
 @dataclass(frozen=True)
@@ -61,84 +44,22 @@ class ViewResult:
 
 @dataclass(frozen=True)
 class ChunkResult:
-    """Results of the views that a chunk owns, by name, and the terms of every step."""
+    """Results of the views that a chunk owns, by name, and what was recorded of the whole.
+
+    Attributes:
+        views: name → result.
+        history: the terms of every step.
+        agreement: of a network that predicts cameras, how far they are from COLMAP's: medians over views,
+            in degrees, and in parts of the centres' mean distance from their middle. Else empty.
+    """
 
     views: dict[str, ViewResult]
     history: list[dict[str, float]]
-
-
-def choose_device(name: str) -> torch.device:
-    """The device that ``--device`` names.
-
-    Raises:
-        MissingError: it is not there.
-    """
-    import torch
-
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-        torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise MissingError(f"--device {name}: not usable here ({error}); try --device cpu") from error
-    return device
-
-
-def weights_file(config: NetworkConfig) -> Path:
-    """The file that ``--weights`` names, or the one in the package."""
-    from tco.backbones.weights import EMBEDDED
-
-    return Path(config.weights).expanduser() if config.weights else EMBEDDED
-
-
-def load_network(config: NetworkConfig) -> tuple[Sweep, torch.device]:
-    """The network on its device.
-
-    Raises:
-        MissingError: no such device, or weights that are missing or of another network.
-    """
-    from tco.backbones.weights import WeightsError, load_sweep
-
-    device = choose_device(config.device)
-    try:
-        return load_sweep(weights_file(config), device), device
-    except WeightsError as error:
-        raise MissingError(str(error)) from error
-
-
-def free_memory() -> int:
-    """Bytes that can be had without swapping.
-
-    On Linux ``MemAvailable``, which, unlike the free pages, counts what the file cache would give back;
-    elsewhere half of what is installed.
-    """
-    meminfo = Path("/proc/meminfo")
-    for line in meminfo.read_text().splitlines() if meminfo.is_file() else ():
-        if line.startswith("MemAvailable:"):
-            return 1024 * int(line.split()[1])
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
-
-
-def chunk_limit(views: Sequence[View], config: NetworkConfig, memory: int) -> int:
-    """Views a chunk: what half of the memory holds beside one decoding with gradients, from 2 to 40.
-
-    The bytes a pixel are estimates on the safe side, from the sizes of the arrays, not measurements.
-    """
-    if config.chunk_size:
-        return max(2, config.chunk_size)
-    height, width = canvas_size(views)
-    pixels = height * width
-    room = memory / 2 - pixels * BYTES_STEP
-    return int(np.clip(room / (pixels * BYTES_VIEW), 2, 40))
-
-
-BYTES_VIEW, BYTES_STEP = 300, 6000
-"""Memory that stays for each view of a chunk, and that one step needs, in bytes a pixel of the canvas."""
+    agreement: dict[str, float]
 
 
 def predict_chunk(
-    network: tuple[Sweep, torch.device],
+    network: tuple[Backbone, torch.device],
     tracks: Tracks,
     views: Sequence[View],
     chunk: Chunk,
@@ -158,16 +79,18 @@ def predict_chunk(
     Raises:
         InputError: the points do not project where the keypoints are, or an image cannot be read.
     """
+    from tco.align import KnownCameras
     from tco.optimize import errors_at_points, optimize
 
     (backbone, device), (prior_config, tco_config, seed) = network, settings
+    aligned = None if backbone.uses_cameras else KnownCameras(backbone)
     members = [views[i] for i in chunk.views]
     frame = chunk_frame(tracks, members)
     images, cameras = batch(members, frame)
     check = check_projection(tracks, members, frame, cameras)
     priors = build_priors(tracks, members, frame, prior_config, seed)
     outcome = optimize(
-        backbone,
+        aligned or backbone,
         images.to(device),
         priors.optimise.to(device),
         tco_config,
@@ -190,12 +113,31 @@ def predict_chunk(
             "held_out_within_5_percent": float((held[i].abs() < 0.05).float().mean())
             if len(held[i])
             else None,
+            "error_of_one_depth": _error_of_one_depth(priors.optimise.sparse[i].depth),
             "reprojection_error_pixels": check.per_view.get(view.name),
             "correction": _correction(outcome, i, frame.scale),
         }
         corrected = corrected_view(view, frame.scale, cameras, moved, i)
         results[view.name] = ViewResult(_maps(view, prediction, i, valid, frame.scale), figures, corrected)
-    return ChunkResult(results, outcome.history)
+    if aligned is not None:
+        own = aligned.history
+        steps = [
+            terms | {f"own_{k}": v for k, v in more.items()} for terms, more in _paired(outcome.history, own)
+        ]
+        return ChunkResult(results, steps, aligned.agreement)
+    return ChunkResult(results, outcome.history, {})
+
+
+def _paired(
+    steps: list[dict[str, float]], own: list[dict[str, float]]
+) -> list[tuple[dict[str, float], dict[str, float]]]:
+    """Each step with the penalties of the network's own cameras, where both were computed once a step."""
+    return list(zip(steps, own if len(own) == len(steps) else [{}] * len(steps), strict=True))
+
+
+def _error_of_one_depth(depth: torch.Tensor) -> float:
+    """Median relative error, at points of these depths (N,), of a map that has their median everywhere."""
+    return float((depth.median() / depth - 1).abs().median())
 
 
 def _median(errors: torch.Tensor) -> float | None:

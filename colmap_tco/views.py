@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -43,8 +43,9 @@ class ViewConfig:
     """How images are prepared for the network."""
 
     max_image_size: int = knob(
-        256,
-        "longer side of the images that the network sees, pixels; memory and time grow with its square",
+        0,
+        "longer side of the images that the network sees, pixels; memory and time grow with its square. 0: "
+        "what the network was trained with, 256 for sweep, 518 for vggt and pi3",
     )
     mask_path: str = knob(
         "",
@@ -102,17 +103,22 @@ class ChunkFrame:
         return pose
 
 
-def make_views(workspace: Workspace, config: ViewConfig, stride: int) -> tuple[list[View], dict[str, str]]:
+def make_views(
+    workspace: Workspace, config: ViewConfig, stride: int, usual_size: int = 256
+) -> tuple[list[View], dict[str, str]]:
     """The usable images of a workspace as views, ordered by name, and name → reason for the others.
 
     Args:
         workspace: the checked workspace.
         config: size and masks.
         stride: of the backbone; sides of network images are multiples of it.
+        usual_size: longer side of network images where the configuration names none.
 
     Raises:
         InputError: no image is left, or there are no masks in the folder that was named.
     """
+    if config.max_image_size == 0:
+        config = replace(config, max_image_size=usual_size)
     if config.max_image_size < stride:
         raise InputError(f"--max_image_size {config.max_image_size} is below the network's stride {stride}")
     views: list[View] = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -14,11 +14,13 @@ from torch import Tensor
 
 from tco.backbones.base import Backbone
 from tco.corrections import CameraCorrections
+from tco.free import FreePixels
 from tco.lora import LoRAConfig, adapted
 from tco.objective import NothingVisibleError, ObjectiveConfig, consistency, photometric
 from tco.options import TCOConfig
-from tco.penalties import sparse_depth
-from tco.surfels import from_depth
+from tco.penalties import focal, rotation, sparse_depth, translation
+from tco.schedule import Sources, Stagnation, draw_targets
+from tco.surfels import SurfelConfig, from_depth
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
 
 logger = logging.getLogger(__name__)
@@ -69,7 +71,20 @@ def optimize(
         report: called after every step with its number and its terms.
 
     Raises:
-        ValueError: a term has a weight and its prior is missing.
+        ValueError: a term has a weight and its prior is missing, or nothing may change.
+
+    Example, a network of three numbers that learns where a wall is:
+
+    >>> from tco.options import TCOConfig
+    >>> from tco.optimize import optimize
+    >>> from tco.toy import Toy, wall
+    >>> scene, network = wall(), Toy()
+    >>> config = TCOConfig(steps=12, rate=0.01, lora_targets=("plane",))
+    >>> plain = optimize(network, scene.views, scene.priors, TCOConfig(steps=0))
+    >>> adapted = optimize(network, scene.views, scene.priors, config)
+    >>> error = [float((o.prediction.depth / scene.depth - 1).abs().mean()) for o in (plain, adapted)]
+    >>> error[1] < error[0] / 3
+    True
     """
     config = config or TCOConfig()
     with torch.no_grad():
@@ -84,6 +99,9 @@ def optimize(
             terms = run.step(step)
             if report is not None:
                 report(step, terms)
+            if run.stopped:
+                logger.info("stopped after %d steps: the error at hidden points falls no more", step + 1)
+                break
         return run.outcome()
 
 
@@ -98,31 +116,44 @@ class _Run:
             raise ValueError("optimisation needs cameras, overlap and sparse points as priors")
         self.backbone, self.views, self.priors, self.config = backbone, views, priors, config
         self.encoded, self.context, self.generator = encoded, context, generator
-        self.overlap, self.sparse = priors.overlap, priors.sparse
+        self.given, self.overlap, self.sparse = priors.cameras, priors.overlap, priors.sparse
+        self.encoded_cameras = priors.cameras
+        self.age = [0] * len(views)
         self.corrections = CameraCorrections(priors) if config.camera_rate > 0 else None
+        a = config.ablation
+        self.free = FreePixels(context.depth, a.free_depth, a.free_surfels)
+        self.sources = Sources(a.source_order, priors.overlap, generator)
+        self.stagnation = Stagnation(len(views), config.stop_after) if config.stop_after > 0 else None
         self.objective = ObjectiveConfig(
             occlusion_tolerance=config.occlusion_tolerance,
             exposure=config.exposure,
             structure=config.structure,
         )
-        self.order: list[int] = []
+        self.surfels = SurfelConfig(a.radius_factor, confident_opacity=a.confident_opacity)
         self.history: list[dict[str, float]] = []
         self.rolled_back: list[int] = []
+        self.stopped = False
 
     def adapters(self) -> AbstractContextManager[list[torch.nn.Parameter]]:
         """Low-rank adapters on the decoder, drawn from this run's generator."""
         c = self.config
-        lora = LoRAConfig(rank=c.lora_rank, alpha=c.lora_alpha, targets=c.lora_targets)
+        lora = LoRAConfig(c.lora_rank, c.lora_alpha, c.lora_targets, c.ablation.unfrozen)
         return adapted(self.backbone.decoder(), lora, self.generator)
 
     def prepare(self, parameters: Sequence[torch.nn.Parameter]) -> None:
         """Optimiser over the adapters and the camera corrections; remember the start as the best state."""
         c = self.config
-        groups: list[dict[str, Any]] = [{"params": list(parameters), "lr": c.rate}]
+        groups: list[dict[str, Any]] = [
+            {"params": list(parameters), "lr": c.rate},
+            {"params": list(self.free.parameters()), "lr": c.ablation.free_rate},
+        ]
         if self.corrections is not None:
             groups.append({"params": list(self.corrections.parameters()), "lr": c.camera_rate})
-        self.optimiser = torch.optim.Adam(groups)
         self.parameters = [p for group in groups for p in group["params"]]
+        if not self.parameters:
+            raise ValueError("there is nothing to optimise: no adapters, no camera_rate, no free pixels")
+        self.optimiser = torch.optim.Adam([group for group in groups if group["params"]])
+        self.active: tuple[str, ...] = ()
         self.best, self.best_loss = self._state(), math.inf
 
     def _state(self) -> tuple[list[Tensor], Prediction]:
@@ -131,35 +162,45 @@ class _Run:
 
     def cameras(self) -> Cameras:
         """The cameras as they are believed now."""
-        assert self.priors.cameras is not None
-        return self.priors.cameras if self.corrections is None else self.corrections()
+        return self.given if self.corrections is None else self.corrections()
 
-    def step(self, number: int) -> dict[str, float]:
-        """One step; returns its terms and their weighted sum."""
+    def weights(self, number: int) -> dict[str, float]:
+        """The weight of each term in a step; a term that is not here is not computed."""
         c = self.config
-        if number and number % c.refresh == 0:
-            with torch.no_grad():
-                self.context = self.backbone.decode(self.encoded, context=self.context)
-        source = self._next_source()
-        terms = self._terms(source)
-        if not terms:
-            self.history.append({"loss": 0.0})
-            return self.history[-1]
-        weights = {
+        every = {
             "photometric": c.photometric_weight,
             "consistency": c.consistency_weight if number >= c.consistency_start * c.steps else 0.0,
             "sparse": c.sparse_weight,
-            "cameras": c.camera_weight,
+            "cameras": 0.0 if self.corrections is None else c.camera_weight,
         }
+        if c.ablation.plain_cameras and self.corrections is not None:
+            every["cameras"] = 1.0
+        return {name: weight for name, weight in every.items() if weight > 0}
+
+    def step(self, number: int) -> dict[str, float]:
+        """One step; returns its terms and their weighted sum."""
+        weights = self.weights(number)
+        if tuple(weights) != self.active:
+            # Sums of other terms cannot be compared: the best loss so far is forgotten.
+            self.active, self.best_loss = tuple(weights), math.inf
+        sources = self.sources.draw(self.config.sources)
+        terms = self._terms(number, sources, weights)
+        hidden = terms.pop("hidden", None)
+        if not terms:
+            self.history.append({"loss": 0.0})
+            return self.history[-1]
         loss = torch.stack([weights[name] * value for name, value in terms.items()]).sum()
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.parameters, c.clip)
+        norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.config.clip)
         figures = {
             **{name: float(value.detach()) for name, value in terms.items()},
             "loss": float(loss.detach()),
         }
         self._update(number, figures["loss"], bool(torch.isfinite(norm)))
+        if hidden is not None and self.stagnation is not None:
+            figures["hidden"] = float(hidden)
+            self.stopped = self.stagnation.add(sources[0], figures["hidden"])
         self.history.append(figures)
         return figures
 
@@ -185,81 +226,161 @@ class _Run:
         for p, kept in zip(self.parameters, values, strict=True):
             p.copy_(kept)
 
-    def _next_source(self) -> int:
-        """Views in a random order, each once before any comes again."""
-        if not self.order:
-            self.order = torch.randperm(len(self.views), generator=self.generator).tolist()
-        return self.order.pop()
-
-    def _targets(self, source: int) -> list[int]:
-        """Views to render into: drawn without repetition, with the number of common points as odds."""
-        odds = self.overlap[source].cpu().clone()
-        odds[source] = 0
-        count = min(self.config.targets, int((odds > 0).sum()))
-        if count == 0:
-            return []
-        return torch.multinomial(odds, count, generator=self.generator).tolist()
-
-    def _terms(self, source: int) -> dict[str, Tensor]:
-        """Named terms of one source view."""
-        c, points = self.config, self.sparse[source]
-        shown = torch.rand(len(points), generator=self.generator).to(points.depth.device) >= c.point_dropout
-        encoded = self.encoded
-        if c.point_dropout > 0 and int(shown.sum()) >= FEWEST_POINTS:
-            encoded = self.backbone.with_points(encoded, {source: points[shown]})
-        prediction = self.backbone.decode(encoded, [source], self.context)
-        cameras, targets = self.cameras(), self._targets(source)
-        terms: dict[str, Tensor] = {}
-        if targets:
-            try:
-                terms.update(self._compatibility(source, targets, prediction, cameras))
-            except NothingVisibleError as error:
-                logger.warning("%s: no compatibility in this step: %s", self.views.names[source], error)
-        if c.sparse_weight > 0 and len(points):
-            terms["sparse"] = sparse_depth(prediction.depth[0], points)
-        if self.corrections is not None:
-            terms["cameras"] = self.corrections.penalty()
+    def _terms(self, number: int, sources: list[int], weights: Mapping[str, float]) -> dict[str, Tensor]:
+        """Named terms of a step, means over its sources; and ``hidden``, the error at hidden points."""
+        points = {source: self._hide(source) for source in sources}
+        compatible = weights.keys() & {"photometric", "consistency"}
+        chosen = {s: draw_targets(self.overlap, s, self.config.targets, self.generator) for s in sources}
+        per_source = []
+        cameras = self.cameras()
+        if weights.keys() - {"cameras"}:
+            self._refresh(
+                number, {t for targets in chosen.values() for t in targets} if compatible else set()
+            )
+            prediction = self._predict(points)
+            for source in sources:
+                depth = prediction.depth[prediction.views.index(source)]
+                terms = self._point_terms(source, points[source], depth, weights)
+                if compatible and chosen[source]:
+                    terms |= self._compatibility(source, chosen[source], prediction, cameras, weights)
+                per_source.append(terms)
+        terms = _means(per_source)
+        if "cameras" in weights:
+            terms["cameras"] = self._camera_penalty(cameras)
         return terms
 
-    def _compatibility(
-        self, source: int, targets: list[int], prediction: Prediction, cameras: Cameras
-    ) -> dict[str, Tensor]:
-        """Compatibility of one source with its targets, in colour and in depth."""
-        c, depth, terms = self.config, prediction.depth[0], {}
-        if c.photometric_weight > 0:
-            surfels = from_depth(
-                depth, cameras.K[source], cameras.world_from_cam[source], self.views.images[source],
-                prediction.confidence[0], valid=self.views.valid[source],
-            )  # fmt: skip
-            terms["photometric"] = photometric(
-                surfels, self.views.images[targets], cameras[targets], self.context.depth[targets],
-                self.views.valid[targets], self.objective,
-            )  # fmt: skip
-        if c.consistency_weight > 0:
-            terms["consistency"] = consistency(
-                depth, cameras, source, targets, self.context, c.consistency_tolerance
+    def _hide(self, source: int) -> Tensor:
+        """Which points of a view (N,) the network is shown in this step."""
+        points, share = self.sparse[source], self.config.point_dropout
+        shown = torch.rand(len(points), generator=self.generator).to(points.depth.device) >= share
+        return shown if int(shown.sum()) >= FEWEST_POINTS else torch.ones_like(shown)
+
+    def _predict(self, points: Mapping[int, Tensor]) -> Prediction:
+        """Depths of the sources with a part of their points hidden; of all views if all are decoded."""
+        encoded = self.encoded
+        kept = {s: self.sparse[s][shown] for s, shown in points.items() if not bool(shown.all())}
+        if kept:
+            encoded = self.backbone.with_points(encoded, kept)
+        views = None if self.config.ablation.decode_all else list(points)
+        prediction = self._decode(encoded, views, self.context)
+        if views is None:
+            self.context = _detached(prediction)
+        return prediction
+
+    def _decode(
+        self, encoded: Any, views: list[int] | None = None, context: Prediction | None = None
+    ) -> Prediction:
+        return self.free.apply_to(self.backbone.decode(encoded, views, context))
+
+    @torch.no_grad()
+    def _refresh(self, number: int, needed: Iterable[int]) -> None:
+        """Compute the context anew where it is too old, with corrected cameras if they went far."""
+        c = self.config
+        due = number > 0 and number % c.refresh == 0
+        if due and self._moved():
+            self.encoded_cameras = self.cameras()
+            self.encoded = self.backbone.encode(
+                self.views, replace(self.priors, cameras=self.encoded_cameras)
             )
+            stale = list(range(len(self.views)))
+        elif c.lazy_refresh:
+            stale = sorted(v for v in needed if number - self.age[v] >= c.refresh)
+        else:
+            stale = list(range(len(self.views))) if due else []
+        if stale:
+            self.context = _merged(self.context, self._decode(self.encoded, stale, self.context))
+            for view in stale:
+                self.age[view] = number
+
+    def _moved(self) -> bool:
+        """Whether the network should be given the corrected cameras."""
+        limit = self.config.reencode
+        if self.corrections is None or limit == 0 or not self.backbone.uses_cameras:
+            return False
+        return self.corrections.pixels(self.encoded_cameras, float(self.context.depth.median())) > limit
+
+    def _point_terms(
+        self, source: int, shown: Tensor, depth: Tensor, weights: Mapping[str, float]
+    ) -> dict[str, Tensor]:
+        """Penalty on triangulated points, and the error at those that were hidden, if it is watched."""
+        terms, points = {}, self.sparse[source]
+        if "sparse" in weights and len(points):
+            terms["sparse"] = sparse_depth(depth, points)
+        if self.stagnation is not None and not bool(shown.all()):
+            terms["hidden"] = sparse_depth(depth.detach(), points[~shown])
+        return terms
+
+    def _camera_penalty(self, cameras: Cameras) -> Tensor:
+        """Departure from the cameras' priors."""
+        assert self.corrections is not None
+        if not self.config.ablation.plain_cameras:
+            return self.corrections.penalty(self.config.camera_kernel)
+        pose, given = cameras.world_from_cam, self.given.world_from_cam
+        return rotation(pose, given) + 2 * translation(pose, given) + 0.01 * focal(cameras.K, self.given.K)
+
+    def _compatibility(
+        self, source: int, targets: list[int], prediction: Prediction, cameras: Cameras,
+        weights: Mapping[str, float],
+    ) -> dict[str, Tensor]:  # fmt: skip
+        """Compatibility of one source with its targets, in colour and in depth; empty if nothing is seen."""
+        c, terms = self.config, {}
+        i = prediction.views.index(source)
+        depth = prediction.depth[i]
+        try:
+            if "photometric" in weights:
+                surfels = from_depth(
+                    depth, cameras.K[source], cameras.world_from_cam[source], self.views.images[source],
+                    prediction.confidence[i], valid=self.views.valid[source], config=self.surfels,
+                    adjust=self.free.adjustment(source),
+                )  # fmt: skip
+                terms["photometric"] = photometric(
+                    surfels, self.views.images[targets], cameras[targets], self.context.depth[targets],
+                    self.views.valid[targets], self.objective,
+                )  # fmt: skip
+            if "consistency" in weights:
+                terms["consistency"] = consistency(
+                    depth, cameras, source, targets, self.context, c.consistency_tolerance
+                )
+        except NothingVisibleError as error:
+            logger.warning("%s: no compatibility in this step: %s", self.views.names[source], error)
+            return {}
         return terms
 
     def outcome(self) -> Outcome:
         """Predict all views with the adapted network, as the best step had it if the last ruined it."""
         with torch.no_grad():
-            prediction = self.backbone.decode(self.encoded, context=self.context)
+            prediction = self._decode(self.encoded, context=self.context)
             if not bool(torch.isfinite(prediction.depth).all()):
                 logger.warning("the last step gave depths that are not finite; back to the best state")
                 self._roll_back(self.config.steps)
-                prediction = self.backbone.decode(self.encoded, context=self.context)
+                prediction = self._decode(self.encoded, context=self.context)
             cameras = self.cameras()
         cameras = Cameras(cameras.world_from_cam.detach(), cameras.K.detach())
-        prediction = replace(
-            prediction, depth=prediction.depth.detach(), confidence=prediction.confidence.detach()
-        )
+        prediction = _detached(prediction)
         sizes = {} if self.corrections is None else self.corrections.sizes()
         return Outcome(prediction, cameras, sizes, self.history, tuple(self.rolled_back))
 
 
 FEWEST_POINTS = 4
 """A view keeps at least this many points as input when others are hidden."""
+
+
+def _detached(prediction: Prediction) -> Prediction:
+    depth, confidence = prediction.depth.detach(), prediction.confidence.detach()
+    return replace(prediction, depth=depth, confidence=confidence)
+
+
+def _merged(every: Prediction, part: Prediction) -> Prediction:
+    """The prediction of all views with some of them replaced."""
+    depth, confidence, views = every.depth.clone(), every.confidence.clone(), list(part.views)
+    depth[views], confidence[views] = part.depth, part.confidence
+    return replace(every, depth=depth, confidence=confidence)
+
+
+def _means(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
+    """Mean of each term over the parts that have it, in the order of their first appearance."""
+    names = dict.fromkeys(name for part in parts for name in part)
+    return {name: torch.stack([part[name] for part in parts if name in part]).mean() for name in names}
 
 
 def errors_at_points(prediction: Prediction, points: Sequence[SparseDepth]) -> list[Tensor]:

@@ -2,9 +2,48 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 from tco.config import knob
+
+EVERY = 1_000_000
+"""More than any chunk has views: every target, every source."""
+
+
+@dataclass(frozen=True)
+class AblationConfig:
+    """Variants of the optimisation, to be measured (``benchmarks/ablations.py``)."""
+
+    unfrozen: tuple[str, ...] = knob(
+        (), "name patterns of the decoder's modules that are trained in full beside the adapters; * is all"
+    )
+    radius_factor: float = knob(
+        0.5, "radius of a surfel in steps between neighbouring points; the paper tries 0.05 to 5"
+    )
+    confident_opacity: bool = knob(
+        True, "opacity of a surfel from the confidence of its pixel; without, all are opaque"
+    )
+    free_surfels: bool = knob(False, "learn radii and orientation of each surfel, too")
+    free_depth: bool = knob(
+        False,
+        "learn a factor of each pixel's depth, too; without lora_targets, in place of the network",
+    )
+    free_rate: float = knob(5e-3, "learning rate of what free_surfels and free_depth add (Adam, logarithms)")
+    decode_all: bool = knob(
+        False,
+        "decode all views with gradients in every step, as published, not the source alone",
+    )
+    source_order: str = knob(
+        "epoch",
+        "how source views are drawn. epoch: each once before any comes again; overlap: by the number of "
+        "points they share with the others; uniform: with repetition, as published",
+        choices=("epoch", "overlap", "uniform"),
+    )
+    plain_cameras: bool = knob(
+        False,
+        "hold cameras by the paper's penalties (angle, normalised centres, focal lengths in pixels; weights "
+        "1, 2 and 0.01) instead of by their uncertainty",
+    )
 
 
 @dataclass(frozen=True)
@@ -18,7 +57,8 @@ class TCOConfig:
     lora_rank: int = knob(4, "rank of the adapters; more adapts more and overfits sooner")
     lora_alpha: float = knob(16.0, "adapters are scaled by alpha / rank")
     lora_targets: tuple[str, ...] = knob(
-        ("qkv", "proj", "fc1", "fc2", "conv"), "name patterns of the decoder's layers that get adapters"
+        ("qkv", "proj", "fc1", "fc2", "conv"),
+        "name patterns of the decoder's layers that get adapters; *refine.1.* would be the last block of one",
     )
     photometric_weight: float = knob(
         1.0, "weight of the colours of the rendered surfels; 0 switches rendering off"
@@ -26,18 +66,39 @@ class TCOConfig:
     sparse_weight: float = knob(0.01, "weight of the triangulated points, in inverse depth")
     consistency_weight: float = knob(1.0, "weight of the agreement with the depths of the other views")
     camera_weight: float = knob(
-        1.0, "weight of the pose and focal priors, each in units of its own uncertainty"
+        3e-4,
+        "weight of the pose and focal priors, each in units of its own uncertainty. With b the colour error "
+        "of a right model and n the independent comparisons in a view, b / n is the weight of the most "
+        "probable cameras: 0.02 / 60. Raise it where large parts of the pictures mislead",
     )
     camera_rate: float = knob(
         0.02,
         "learning rate of the small corrections of the cameras, in standard deviations; 0 holds them fixed",
     )
+    camera_kernel: str = knob(
+        "huber",
+        "growth of a camera's penalty beyond 2 standard deviations: quadratic, huber (linear) or cauchy "
+        "(logarithmic, lets a wrong prior go)",
+        choices=("quadratic", "huber", "cauchy"),
+    )
+    reencode: float = knob(
+        1.0,
+        "pixels by which corrections must have moved a view before the network is given the corrected "
+        "cameras, at the next refresh; 0: never",
+    )
     point_dropout: float = knob(
         0.5,
         "share of the points that each step hides from the network and asks it to predict from the others",
     )
+    sources: int = knob(1, "views that each step renders from; more are steadier and as much dearer")
     targets: int = knob(4, "views that each step renders into, drawn from those that overlap most")
     refresh: int = knob(10, "steps after which the depths of all views are computed anew")
+    lazy_refresh: bool = knob(
+        False, "compute depths anew only of the views that a step compares with, when they are that old"
+    )
+    stop_after: int = knob(
+        0, "stop when the error at hidden points has not fallen for this many steps; 0 takes all steps"
+    )
     occlusion_tolerance: float = knob(
         0.02, "a rendered surface further behind the target's own by this share of its depth does not count"
     )
@@ -54,9 +115,20 @@ class TCOConfig:
     )
     structure: float = knob(0.5, "share of the structural term (SSIM) in the comparison of colours")
     clip: float = knob(1.0, "largest norm of the gradient")
+    ablation: AblationConfig = field(default_factory=AblationConfig)
 
     def __post_init__(self) -> None:
-        if self.steps < 0 or self.targets < 1 or self.refresh < 1:
-            raise ValueError("steps must not be negative, targets and refresh at least 1")
+        if self.steps < 0 or self.targets < 1 or self.refresh < 1 or self.sources < 1:
+            raise ValueError("steps must not be negative, targets, sources and refresh at least 1")
         if not 0 <= self.point_dropout < 1:
             raise ValueError(f"point_dropout is a share below 1, not {self.point_dropout}")
+        if self.stop_after > 0 and self.point_dropout == 0:
+            raise ValueError("stop_after watches hidden points, and point_dropout 0 hides none")
+
+    def reference_schedule(self) -> TCOConfig:
+        """The same objective on the published schedule.
+
+        A source drawn uniformly, all views decoded with gradients in every step, every other view a target.
+        """
+        ablation = replace(self.ablation, decode_all=True, source_order="uniform")
+        return replace(self, sources=1, targets=EVERY, refresh=1, lazy_refresh=False, ablation=ablation)

@@ -96,6 +96,57 @@ def _mean_distance(centres: Tensor, name: str) -> Tensor:
     return mean
 
 
+def rotation_uncertain(predicted: Tensor, prior: Tensor, sigma: Tensor, kernel: str = "huber") -> Tensor:
+    """Mean robust penalty on the rotations relative to the first view, in standard deviations.
+
+    The angle of view v is divided by √(σ_v² + σ_1²), since the first view's error is in all of them. The
+    mean is over the views but the first, and the kernel that of :func:`robust` with :data:`THRESHOLD`.
+
+    Args:
+        predicted, prior: (V, 4, 4) world_from_cam, of any worlds.
+        sigma: (V,) radians.
+        kernel: quadratic, huber or cauchy.
+
+    Raises:
+        ValueError: fewer than two views.
+    """
+    ours, theirs = _relative(predicted, prior)
+    angle = rotation_angle(ours[1:, :3, :3], theirs[1:, :3, :3])
+    return robust(angle / (sigma[1:] ** 2 + sigma[0] ** 2).sqrt(), kernel, THRESHOLD).mean()
+
+
+def translation_uncertain(predicted: Tensor, prior: Tensor, sigma: Tensor, kernel: str = "huber") -> Tensor:
+    """Mean robust penalty on the centres relative to the first view, in standard deviations.
+
+    The predicted centres are scaled to the prior's by least squares, weighted by 1 / (σ_v² + σ_1²); the
+    distance that remains is divided by √(σ_v² + σ_1²). The mean is over the views but the first.
+
+    Args:
+        predicted, prior: (V, 4, 4) world_from_cam, of any worlds and scales.
+        sigma: (V,) in the prior's unit of length.
+        kernel: quadratic, huber or cauchy.
+
+    Raises:
+        ValueError: fewer than two views, or all predicted centres in one point, which have no scale.
+    """
+    ours, theirs = (pose[1:, :3, 3] for pose in _relative(predicted, prior))
+    variance = sigma[1:] ** 2 + sigma[0] ** 2
+    square = (ours.square().sum(-1) / variance).sum()
+    if float(square.detach()) * float(variance.min()) <= 1e-18:
+        raise ValueError("the predicted camera centres all coincide: they have no scale")
+    scale = ((ours * theirs).sum(-1) / variance).sum() / square
+    return robust_norm((scale * ours - theirs) / variance.sqrt().unsqueeze(-1), kernel).mean()
+
+
+def focal_uncertain(predicted: Tensor, prior: Tensor, sigma: Tensor, kernel: str = "huber") -> Tensor:
+    """Mean robust penalty on log(f / f_prior) / σ, over the two focal lengths of V views.
+
+    Intrinsics are (V, 3, 3), and sigma (V,) is the standard deviation of the relative focal length.
+    """
+    error = (_focals(predicted) / _focals(prior)).log() / sigma.unsqueeze(-1)
+    return robust(error, kernel, THRESHOLD).mean()
+
+
 def focal(predicted: Tensor, prior: Tensor) -> Tensor:
     """|Δfx| + |Δfy| in pixels, mean over V views, of intrinsics (V, 3, 3): the paper's term."""
     difference = (_focals(predicted) - _focals(prior)).abs()
@@ -165,10 +216,14 @@ class SparseDepthConfig:
     )
 
 
+THRESHOLD = 2.0
+"""Standard deviations at which the robust penalty of a camera stops being quadratic."""
+
+
 def robust(residual: Tensor, kernel: str, threshold: float) -> Tensor:
     """½ r² near zero, with a slower growth beyond ``threshold`` k; any shape.
 
-    huber: k (|r| − k / 2) for |r| > k. cauchy: k² / 2 · log(1 + (r / k)²).
+    quadratic: ½ r² everywhere. huber: k (|r| − k / 2) for |r| > k. cauchy: k² / 2 · log(1 + (r / k)²).
 
     Raises:
         ValueError: a kernel that does not exist.
@@ -177,7 +232,18 @@ def robust(residual: Tensor, kernel: str, threshold: float) -> Tensor:
         return F.huber_loss(residual, torch.zeros_like(residual), reduction="none", delta=threshold)
     if kernel == "cauchy":
         return 0.5 * threshold**2 * torch.log1p((residual / threshold) ** 2)
-    raise ValueError(f"there is no robust kernel {kernel!r}; choose huber or cauchy")
+    if kernel == "quadratic":
+        return 0.5 * residual.square()
+    raise ValueError(f"there is no robust kernel {kernel!r}; choose quadratic, huber or cauchy")
+
+
+def robust_norm(vectors: Tensor, kernel: str, threshold: float = THRESHOLD) -> Tensor:
+    """:func:`robust` of the lengths (…) of vectors (…, N), with the derivative 0 at the zero vector."""
+    square = vectors.square().sum(-1)
+    none = square == 0
+    # The square root has no derivative at 0, where the penalty has: there the length is the constant 0.
+    length = torch.where(none, torch.ones_like(square), square).sqrt()
+    return robust(torch.where(none, torch.zeros_like(length), length), kernel, threshold)
 
 
 def inverse_depth_error(depth: Tensor, sparse: SparseDepth) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from tco.config import knob
-from tco.geometry import pixel_grid, quat_from_matrix, rays, transform
+from tco.geometry import pixel_grid, quat_from_matrix, rays, so3_exp, transform
 from tco.types import _Movable
 
 
@@ -56,6 +56,19 @@ class SurfelConfig:
     min_radius: float = knob(1e-6, "Lower bound on the radii, in units of length.")
 
 
+@dataclass(frozen=True)
+class Adjustment(_Movable):
+    """Learned changes of the surfels of a view, none at zero.
+
+    Attributes:
+        radii: (H, W, 2) logarithms of factors of the two radii.
+        turn: (H, W, 3) rotation vectors in the frame of the surfel.
+    """
+
+    radii: Tensor
+    turn: Tensor
+
+
 def from_depth(
     depth: Tensor,
     K: Tensor,
@@ -65,6 +78,7 @@ def from_depth(
     *,
     valid: Tensor | None = None,
     config: SurfelConfig | None = None,
+    adjust: Adjustment | None = None,
 ) -> Surfels:
     """Surfels of one view, differentiable in depth, camera, image and confidence.
 
@@ -82,6 +96,7 @@ def from_depth(
         valid: (H, W) bool. A surfel is dropped where it is False, where the depth is below
             ``config.min_depth``, and where either holds for a neighbour that its gradients use.
         config: radii, opacities and pixel convention.
+        adjust: changes of radii and orientation, by pixel (ablation).
 
     Returns:
         Surfels in the row-major order of the remaining pixels.
@@ -95,6 +110,8 @@ def from_depth(
     xy = pixel_grid(h, w, depth) + (config.pixel_centre - 0.5)
     points = rays(xy.reshape(-1, 2), K).reshape(h, w, 3) * depth.unsqueeze(-1)
     frame, radii = _frames(points, config)
+    if adjust is not None:
+        frame, radii = frame @ so3_exp(adjust.turn), radii * torch.exp(adjust.radii)
     means = transform(world_from_cam, points.reshape(-1, 3))
     quats = quat_from_matrix(world_from_cam[:3, :3] @ frame.reshape(-1, 3, 3))
     if config.confident_opacity:

@@ -33,6 +33,10 @@ START_UP = (
     "errors",
     "weights",
     "published",
+    "backbones",
+    "memory",
+    "attempts",
+    "check",
 )
 """Modules of ``colmap_tco`` that the command line imports for their settings: nothing in LAZY at the top."""
 

@@ -163,8 +163,9 @@ class VGGT(nn.Module):
         Args:
             network: with its weights; its blocks are converted to ``dtype``.
             dtype: float32 or bfloat16, of the matrix products of all blocks; the heads are float32.
-            recompute: depths of the aggregator whose activations are computed again in the backward pass,
-                which saves their memory for a third more time.
+            recompute: depths of the aggregator whose activations are computed again in the backward
+                pass, for a third more time: with adapters, a view of 518×392 keeps 73 MB a block in
+                float32 without it, 4 MB with it. The attribute can be set at any time.
         """
         super().__init__()
         self.network, self.dtype, self.recompute = network, dtype, recompute

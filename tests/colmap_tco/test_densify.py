@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 from colmap_tco import _pycolmap
+from colmap_tco.backbones import NetworkConfig
 from colmap_tco.chunks import plan_chunks
 from colmap_tco.cli import main
 from colmap_tco.densify import Densified, DensifyConfig, densify
@@ -26,7 +27,6 @@ from colmap_tco.errors import InputError, PartlyDoneError
 from colmap_tco.lock import locked
 from colmap_tco.maps import read_map
 from colmap_tco.ply import read_ply, read_vis
-from colmap_tco.predict import NetworkConfig
 from colmap_tco.priors import PriorConfig, held_out
 from colmap_tco.progress import Progress
 from colmap_tco.tracks import covisibility, read_tracks
@@ -190,7 +190,8 @@ def test_the_report_says_what_was_done(done: Done) -> None:
         assert figures["state"] == "used"
         assert figures["points"] > 50
     assert [len(chunk) for chunk in report["loss"]] == [2]
-    assert {"photometric", "consistency", "sparse", "cameras", "loss"} <= report["loss"][0][0].keys()
+    terms = {name for step in report["loss"][0] for name in step}
+    assert {"photometric", "consistency", "sparse", "cameras", "loss"} <= terms
     held = report["held_out"]
     assert held["points"] == sum(v["points_held_out"] for v in report["views"].values()) > 50
     assert 0.7 < held["within_5_percent"] <= 1 and 0 < held["median_error"] < 0.02
@@ -347,7 +348,7 @@ def test_pictures_that_are_not_in_the_model_are_named_and_harm_nothing(fresh_roo
         text.unlink()
     model.write(str(smaller))
     report = made(fresh_room.root, config()).report
-    assert report["images"] == {"used": len(fresh_room.names), "skipped": 0, "unregistered": 2}
+    assert report["images"] == {"used": len(fresh_room.names), "skipped": 0, "failed": 0, "unregistered": 2}
     states = {image: figures["state"] for image, figures in report["views"].items()}
     assert states == {
         **dict.fromkeys(fresh_room.names, "used"), "new.png": "unregistered", name: "unregistered"
@@ -376,6 +377,68 @@ def test_other_settings_of_the_fusion_keep_the_depth_maps(fresh_room: Room) -> N
     some = next(iter(files))
     assert (anew.folder / some).stat().st_ino != files[some].st_ino
     assert anew.report["points"] == second.report["points"]
+
+
+@pytest.mark.parametrize("kind", ["vggt", "pi3"])
+def test_networks_that_predict_cameras_run_through(fresh_room: Room, tmp_path: Path, kind: str) -> None:
+    """With random weights: every file is there, in COLMAP's cameras, and nobody is told that it is good."""
+    from tests.colmap_tco.test_backbones import written
+
+    weights = str(written(tmp_path / "random.safetensors", kind))
+    network = NetworkConfig(backbone="auto", device="cpu", chunk_size=8, weights=weights)
+    with pytest.raises(PartlyDoneError, match=r"contradict COLMAP's points .*: do not use them"):
+        made(fresh_room.root, config(steps=1, network=network, views=ViewConfig(max_image_size=70)))
+    dense = fresh_room.root / "dense-tco"
+    report = json.loads((dense / "report.json").read_text("utf-8"))
+    assert report["images"]["used"] == len(fresh_room.names) and not report["held_out"]["plausible"]
+    assert len(read_ply(dense / "fused.ply")[0]) == len(read_vis(dense / "fused.ply.vis")) == report["points"]
+    assert (report["points"] == 0) == bool(report["no_points"])
+    assert report["backbone"]["name"] == kind and "holds weights of" in report["backbone"]["reason"]
+    assert report["backbone"]["licence"] == "CC BY-NC 4.0: " + (
+        "no commercial use" if kind == "pi3" else "no commercial use; for that there is vggt-commercial"
+    )
+    assert report["settings"]["tco"]["lora_targets"] == ["qkv", "proj", "fc1", "fc2"]
+    (chunk,) = report["chunks"]
+    assert chunk["agreement"].keys() == {"rotation_degrees", "centre"} and chunk["reduced"] is False
+    assert {"own_rotation", "own_translation", "own_focal"} <= report["loss"][0][0].keys()
+    theirs = poses(fresh_room.root / "sparse" / "0")
+    for name, pose in poses(dense / "sparse").items():
+        np.testing.assert_allclose(pose, theirs[name], atol=1e-9)
+        depth = read_map(dense / "stereo" / "depth_maps" / f"{name}.geometric.bin")
+        assert depth.shape == (56, 70) and (depth > 0).all()
+
+
+def test_out_of_memory_leads_to_smaller_chunks(fresh_room: Room) -> None:
+    """The process is limited so that four views fit and seven do not; the report says so."""
+    words = ["densify", str(fresh_room.root), *FLAGS, "--steps", "0", "--num_threads", "1"]
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, *words], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "out of memory with 7 views" in done.stderr
+    report = json.loads((fresh_room.root / "dense-tco" / "report.json").read_text("utf-8"))
+    assert report["images"]["used"] == len(fresh_room.names)
+    assert all(chunk["reduced"] and len(chunk["views"]) <= 3 for chunk in report["chunks"])
+    assert_accurate(fresh_room, fresh_room.root / "dense-tco", share=0.6)
+
+
+LIMITED = """
+import sys
+from colmap_tco import densify
+from colmap_tco.cli import main
+
+predict = densify.predict_chunk
+
+def limited(network, tracks, views, chunk, settings, report):
+    import torch
+    if len(chunk.views) > 3:
+        torch.empty(1 << 60, dtype=torch.uint8)
+    return predict(network, tracks, views, chunk, settings, report)
+
+densify.predict_chunk = limited
+sys.exit(main(sys.argv[1:]))
+"""
+"""Chunks of more than three views ask for more memory than any machine has."""
 
 
 def test_a_workspace_in_use_is_refused(fresh_room: Room) -> None:

@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 import torch
 
+from colmap_tco.backbones import NetworkConfig, load, select
 from colmap_tco.chunks import Chunk
-from colmap_tco.errors import InputError, MissingError
-from colmap_tco.predict import (
-    ChunkResult,
-    NetworkConfig,
-    choose_device,
-    chunk_limit,
-    corrected_view,
-    free_memory,
-    load_network,
-    predict_chunk,
-)
+from colmap_tco.errors import InputError
+from colmap_tco.predict import ChunkResult, corrected_view, predict_chunk
 from colmap_tco.priors import PriorConfig, chunk_frame
 from colmap_tco.tracks import Tracks, read_tracks
 from colmap_tco.views import ChunkFrame, View, ViewConfig, canvas_cameras, make_views
@@ -51,59 +41,9 @@ def known(room: Room) -> Input:
 def predicted(known: Input, chunk: Chunk, steps: int = 0, holdout: float = 0.2) -> ChunkResult:
     settings = (PriorConfig(holdout=holdout), TCOConfig(steps=steps), 0)
     return predict_chunk(
-        load_network(NetworkConfig(device="cpu")), known.tracks, known.views, chunk, settings, lambda _: None
-    )
-
-
-@pytest.mark.parametrize("name", ["cuda:99", "tpu", "gpu please", "cpu:x"])
-def test_a_device_that_is_not_there_is_an_error_with_the_remedy(name: str) -> None:
-    with pytest.raises(MissingError, match=f"--device {name}: not usable here.*--device cpu"):
-        choose_device(name)
-
-
-def test_devices_are_found() -> None:
-    assert choose_device("cpu") == torch.device("cpu")
-    assert choose_device("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
-
-
-def test_weights_that_are_missing_or_foreign_are_an_error(tmp_path: Path) -> None:
-    with pytest.raises(MissingError, match=r"none\.safetensors: no such file"):
-        load_network(NetworkConfig(weights=str(tmp_path / "none.safetensors")))
-    (tmp_path / "page.safetensors").write_text("<html>")
-    with pytest.raises(MissingError, match=r"page\.safetensors: not a complete safetensors file"):
-        load_network(NetworkConfig(weights=str(tmp_path / "page.safetensors")))
-
-
-def test_the_network_is_frozen_and_in_evaluation_mode() -> None:
-    network, device = load_network(NetworkConfig(device="cpu"))
-    assert device == torch.device("cpu")
-    assert not network.training and not any(p.requires_grad for p in network.parameters())
-
-
-def test_free_memory_counts_what_the_file_cache_would_give_back() -> None:
-    page = os.sysconf("SC_PAGE_SIZE")
-    assert 0 < free_memory() <= os.sysconf("SC_PHYS_PAGES") * page
-    meminfo = Path("/proc/meminfo")
-    if not meminfo.exists():
-        pytest.skip("only Linux says how much memory is available")
-    lines = dict(line.split(":") for line in meminfo.read_text().splitlines())
-    assert free_memory() == pytest.approx(1024 * int(lines["MemAvailable"].split()[0]), rel=0.2)
-
-
-def test_chunks_grow_with_the_memory_and_shrink_with_the_images(known: Input) -> None:
-    limits = [
-        chunk_limit(known.views, NetworkConfig(), memory) for memory in np.logspace(6, 13, 40).astype(int)
-    ]
-    assert limits == sorted(limits)
-    assert (limits[0], limits[-1]) == (2, 40)
-    large = [replace(view, network=view.network.resized(1024, 768)) for view in known.views]
-    memory = 2 * 10**9
-    assert chunk_limit(large, NetworkConfig(), memory) < chunk_limit(known.views, NetworkConfig(), memory)
-
-
-def test_the_size_of_a_chunk_can_be_given(known: Input) -> None:
-    for size, expected in ((5, 5), (2, 2), (1, 2), (100, 100)):
-        assert chunk_limit(known.views, NetworkConfig(chunk_size=size), 0) == expected
+        (load(select(NetworkConfig(backbone="sweep", device="cpu"))), torch.device("cpu")),
+        known.tracks, known.views, chunk, settings, lambda _: None,
+    )  # fmt: skip
 
 
 def test_maps_are_in_colmap_units_and_of_the_size_of_the_network_images(known: Input, room: Room) -> None:

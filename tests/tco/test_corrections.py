@@ -99,6 +99,34 @@ def test_the_penalty_is_half_the_squared_distance_in_sigmas() -> None:
     )
 
 
+@pytest.mark.parametrize(("kernel", "growth"), [("quadratic", 37.5), ("huber", 10.0), ("cauchy", 2.554)])
+def test_a_prior_that_is_far_wrong_is_let_go_by_a_robust_kernel(kernel: str, growth: float) -> None:
+    """What five standard deviations more cost a view that is five away already, each part of it alone."""
+    for name in ("turn", "shift", "zoom"):
+        costs = []
+        for size in (0.5, 5.0, 10.0):
+            corrections = CameraCorrections(priors())
+            getattr(corrections, name).data.reshape(V, -1)[1, 0] = size
+            costs.append(V * float(corrections.penalty(kernel)))
+        assert costs[0] == pytest.approx(0.125, rel=0.05)
+        assert costs[2] - costs[1] == pytest.approx(growth, rel=0.01)
+
+
+def test_how_far_images_of_points_went_in_pixels() -> None:
+    """2 σ of turn, 1 σ of centre and of focal length, compared with projections of points at the border."""
+    known, corrections = priors(), CameraCorrections(priors())
+    assert known.cameras is not None
+    assert corrections.pixels(known.cameras, 2.0) == 0
+    corrections.turn.data[1, 1] = 2.0
+    assert corrections.pixels(known.cameras, 2.0) == pytest.approx(50 * 0.04, rel=1e-6)
+    corrections = CameraCorrections(priors())
+    corrections.shift.data[2, 0] = 1.0
+    assert corrections.pixels(known.cameras, 2.0) == pytest.approx(50 * 0.2 / 2, rel=1e-6)
+    corrections = CameraCorrections(priors())
+    corrections.zoom.data[0] = 1.0
+    assert corrections.pixels(known.cameras, 2.0) == pytest.approx(32 * math.expm1(0.005), rel=1e-6)
+
+
 def test_corrected_poses_are_rigid() -> None:
     pose = moved(size=5.0)().world_from_cam.detach()
     eye = torch.eye(3, dtype=F64).expand(V, 3, 3)

@@ -17,10 +17,9 @@ from tco.backbones.base import Backbone
 from tco.backbones.sweep import Sweep
 from tco.backbones.sweeping import Hints, interpolate_points
 from tco.backbones.weights import load_sweep
-from tco.geometry import invert, so3_exp
 from tco.optimize import Outcome, errors_at_points, optimize
 from tco.options import TCOConfig
-from tco.penalties import rotation_angle, sparse_depth
+from tco.penalties import sparse_depth
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
 
 Scene = tuple[Views, Priors, Tensor]
@@ -184,33 +183,6 @@ def test_optimisation_lowers_the_loss(network: Sweep, scene: Scene) -> None:
     assert losses[-2:].mean() < 0.95 * losses[0].mean()
 
 
-def rotation_error(cameras: Cameras, truth: Cameras) -> float:
-    """Root mean square of the angle between estimated and true relative rotations, degrees."""
-    ours, theirs = (invert(c.world_from_cam)[:, None] @ c.world_from_cam[None] for c in (cameras, truth))
-    angle = rotation_angle(ours[..., :3, :3], theirs[..., :3, :3])
-    return math.degrees(float(angle[~torch.eye(V, dtype=torch.bool)].square().mean().sqrt()))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_colours_move_wrong_cameras_towards_the_truth(network: Sweep, scene: Scene, seed: int) -> None:
-    """Rotations off by about 0.6 degrees, almost a pixel: 40 % of the error or more is gone."""
-    views, priors, _ = scene
-    assert priors.cameras is not None
-    sigma, g = math.radians(0.35), torch.Generator().manual_seed(seed)
-    pose = priors.cameras.world_from_cam.clone()
-    pose[:, :3, :3] = pose[:, :3, :3] @ so3_exp(sigma * torch.randn(V, 3, generator=g))
-    wrong = uncertain(replace(priors, cameras=Cameras(pose, priors.cameras.K)), sigma, 1e-4, 1e-4)
-    config = TCOConfig(
-        steps=16, rate=0, camera_rate=0.3, sparse_weight=0, photometric_weight=100, camera_weight=0.02
-    )
-    outcome = optimize(network, views, wrong, config)
-    before = rotation_error(Cameras(pose, priors.cameras.K), priors.cameras)
-    assert before > 0.4
-    assert rotation_error(outcome.cameras, priors.cameras) < 0.6 * before
-    assert max(outcome.corrections["rotation_degrees"]) > 0.1
-
-
 def test_certain_cameras_stay_where_they_are(scene: Scene) -> None:
     views, priors, _ = scene
     certain = uncertain(priors, 1e-7, 1e-7, 1e-7)
@@ -238,10 +210,10 @@ def test_every_step_is_reported_with_its_terms(scene: Scene) -> None:
     assert [step for step, _ in seen] == list(range(config.steps))
     assert [terms for _, terms in seen] == outcome.history
     for step, terms in seen:
-        assert terms.keys() == {"photometric", "consistency", "sparse", "cameras", "loss"}
+        late = {"consistency"} if step >= config.steps / 2 else set()
+        assert terms.keys() == {"photometric", "sparse", "cameras", "loss"} | late
         total = 3 * terms["photometric"] + 0.25 * terms["sparse"] + 2 * terms["cameras"]
-        total += 50 * terms["consistency"] * (step >= config.steps / 2)
-        assert terms["loss"] == pytest.approx(total, rel=1e-5)
+        assert terms["loss"] == pytest.approx(total + 50 * terms.get("consistency", 0), rel=1e-5)
     assert outcome.history[0]["cameras"] == 0
 
 
@@ -251,7 +223,8 @@ def test_a_weight_of_zero_switches_its_term_off(scene: Scene, term: str) -> None
     off = replace(SMALL, **{f"{term}_weight": 0.0})
     history = optimize(Small(), views, priors, off).history
     assert all(term not in terms for terms in history)
-    assert all(len(terms) == 4 for terms in history)
+    late = [len(terms) for terms in history[len(history) // 2 :]]
+    assert late == [4] * len(late)
 
 
 def test_cameras_that_may_not_move_have_no_term_and_need_no_uncertainty(scene: Scene) -> None:
@@ -271,9 +244,36 @@ def test_with_every_term_off_nothing_changes(scene: Scene) -> None:
     config = replace(
         SMALL, photometric_weight=0, consistency_weight=0, sparse_weight=0, camera_weight=0, camera_rate=0
     )
-    outcome = optimize(Small(), views, priors, config)
-    assert len(outcome.history) == SMALL.steps
+    small = Small()
+    outcome = optimize(small, views, priors, config)
+    assert len(outcome.history) == SMALL.steps and small.decoded == []
     assert torch.equal(depth_of(outcome), depth_of(optimize(Small(), views, priors, TCOConfig(steps=0))))
+
+
+def test_with_nothing_to_optimise_there_is_an_error(scene: Scene) -> None:
+    views, priors, _ = scene
+    with pytest.raises(ValueError, match="nothing to optimise"):
+        optimize(Small(), views, priors, replace(SMALL, lora_targets=(), camera_rate=0))
+
+
+def test_what_has_no_weight_is_not_computed(scene: Scene) -> None:
+    """Depths of the other views that would end the optimisation are never looked at."""
+    views, priors, _ = scene
+    unlucky = replace(views, images=views.images.clone())
+    unlucky.images[:] = math.nan
+    only_points = replace(SMALL, photometric_weight=0, consistency_weight=0)
+
+    class Blind(Small):
+        """Interpolates the points, changed by a convolution of what is not the image."""
+
+        def encode(self, views: Views, priors: Priors) -> Any:
+            return super().encode(replace(views, images=torch.ones_like(views.images)), priors)
+
+    outcome = optimize(Blind(), unlucky, priors, only_points)
+    assert outcome.rolled_back == ()
+    assert optimize(Blind(), unlucky, priors, SMALL).rolled_back != ()
+    early = replace(SMALL, photometric_weight=0, consistency_start=1.0)
+    assert all("consistency" not in terms for terms in optimize(Small(), views, priors, early).history)
 
 
 @pytest.mark.parametrize("name", ["cameras", "overlap", "sparse"])
@@ -330,7 +330,9 @@ def test_views_that_share_no_point_are_never_compared(scene: Scene) -> None:
     overlap = priors.overlap.clone()
     overlap[2], overlap[:, 2] = 0, 0
     small = Small()
-    outcome = optimize(small, views, replace(priors, overlap=overlap), replace(SMALL, steps=V))
+    outcome = optimize(
+        small, views, replace(priors, overlap=overlap), replace(SMALL, steps=V, consistency_start=0)
+    )
     for (source,), terms in zip(small.decoded, outcome.history, strict=True):
         assert ("photometric" in terms) == ("consistency" in terms) == (source != 2)
         assert "sparse" in terms
@@ -392,9 +394,9 @@ def test_the_best_state_is_the_one_of_the_lowest_loss(scene: Scene) -> None:
     views, priors, _ = scene
     outcome = optimize(Breaking((11,), math.nan), views, priors, replace(SMALL, steps=12))
     losses = [terms["loss"] for terms in outcome.history[:11]]
-    best = int(np.argmin(losses))
-    assert outcome.rolled_back == (11,) and best > 0
-    until = optimize(Small(), views, priors, replace(SMALL, steps=best))
+    best = 6 + int(np.argmin(losses[6:]))  # consistency joins the loss at 6: what was before is another sum
+    assert outcome.rolled_back == (11,) and min(losses[:6]) < losses[best]
+    until = optimize(Small(), views, priors, replace(SMALL, steps=best, consistency_start=6 / best))
     assert torch.equal(depth_of(outcome), depth_of(until))
 
 
@@ -441,7 +443,16 @@ def test_errors_at_points_are_those_of_the_pixels_they_fall_into() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"steps": -1}, {"targets": 0}, {"refresh": 0}, {"point_dropout": 1.0}, {"point_dropout": -0.1}]
+    "wrong",
+    [
+        {"steps": -1},
+        {"targets": 0},
+        {"sources": 0},
+        {"refresh": 0},
+        {"point_dropout": 1.0},
+        {"point_dropout": -0.1},
+        {"stop_after": 5, "point_dropout": 0.0},
+    ],
 )
 def test_settings_out_of_range_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=r"steps|point_dropout"):

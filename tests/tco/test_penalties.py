@@ -116,6 +116,65 @@ def test_focal_terms_in_closed_form() -> None:
     assert float(penalties.intrinsics_reference(a, b)) == pytest.approx((2 * 2.5 + 2 * 0.125 + 1.5) / 2 / 6)
 
 
+def test_uncertain_terms_in_closed_form() -> None:
+    """Errors of known sizes over √(σ² + σ₁²): quadratic within two of them, linear beyond."""
+    prior = poses(3)
+    turns = torch.tensor([0.0, 0.05, 0.5], dtype=F64).unsqueeze(-1) * AXIS
+    predicted = prior @ rigid(so3_exp(turns), torch.zeros(3, 3, dtype=F64))
+    sigma = torch.tensor([0.03, 0.04, 0.04], dtype=F64)  # 0.05 together
+    got = penalties.rotation_uncertain(predicted, prior, sigma)
+    assert float(got) == pytest.approx((0.5 * 1 + 2 * (10 - 1)) / 2)
+    assert float(penalties.rotation_uncertain(predicted, prior, sigma, "quadratic")) == pytest.approx(
+        (0.5 + 50) / 2
+    )
+
+    prior = torch.eye(4, dtype=F64).repeat(3, 1, 1)
+    prior[1:, 0, 3] = torch.tensor([1.0, -1])
+    predicted = prior.clone()
+    predicted[1:, 1, 3] = 0.05  # across both centres: the best scale is 1 / (1 + 0.05²)
+    scale = 1 / (1 + 0.05**2)
+    residual = math.hypot(1 - scale, 0.05 * scale) / 0.05
+    got = penalties.translation_uncertain(4 * predicted, prior, sigma)
+    assert float(got) == pytest.approx(0.5 * residual**2, rel=1e-9)
+
+    K = torch.tensor([[100.0, 0, 50], [0, 110, 40], [0, 0, 1]], dtype=F64).repeat(2, 1, 1)
+    zoomed = K.clone()
+    zoomed[1, 0, 0] *= math.exp(0.02)
+    spread = torch.tensor([0.01, 0.02], dtype=F64)
+    assert float(penalties.focal_uncertain(zoomed, K, spread)) == pytest.approx(0.5 / 4)
+
+
+def test_uncertain_pose_terms_do_not_depend_on_the_world() -> None:
+    predicted, prior, sigma = poses(5), poses(5, 1), torch.full((5,), 0.4, dtype=F64)
+    for term in (penalties.rotation_uncertain, penalties.translation_uncertain):
+        reference = float(term(predicted, prior, sigma))
+        assert float(term(similarity(predicted, 3.0, 7), prior, sigma)) == pytest.approx(reference)
+        assert float(term(similarity(predicted, 3.0, 7), predicted, sigma)) == pytest.approx(0, abs=1e-12)
+        assert reference > 0.1
+        with pytest.raises(ValueError, match="at least two views"):
+            term(poses(1), poses(1), sigma[:1])
+    # A prior in other units has its σ in other units.
+    scaled = penalties.translation_uncertain(predicted, similarity(prior, 5.0, 2), 5 * sigma)
+    torch.testing.assert_close(scaled, penalties.translation_uncertain(predicted, prior, sigma))
+    with pytest.raises(ValueError, match="coincide"):
+        penalties.translation_uncertain(torch.eye(4, dtype=F64).repeat(5, 1, 1), prior, sigma)
+
+
+def test_a_prior_counts_by_its_uncertainty() -> None:
+    """The view whose prior is wrong has ten times the σ of the others: a hundredth of the force."""
+    prior, sigma = poses(4), torch.full((4,), 1.0, dtype=F64)
+    forces = []
+    for spread in (1.0, 10.0):
+        sigma[2] = spread
+        pose = prior.clone()
+        pose[2, 0, 3] += 0.1
+        pose.requires_grad_(True)
+        penalties.translation_uncertain(pose, prior, sigma).backward()
+        assert pose.grad is not None
+        forces.append(float(pose.grad[2, :3, 3].norm()))
+    assert forces[1] / forces[0] == pytest.approx(2 / 101, rel=0.1)
+
+
 def depths() -> tuple[Tensor, Tensor, Tensor]:
     g = torch.Generator().manual_seed(3)
     predicted = 1 + torch.rand(2, 5, 6, generator=g, dtype=F64)
@@ -145,18 +204,28 @@ def test_empty_depth_masks_are_errors() -> None:
         penalties.depth(torch.ones_like(predicted), prior, mask)
 
 
-@pytest.mark.parametrize("kernel", ["huber", "cauchy"])
+@pytest.mark.parametrize("kernel", ["quadratic", "huber", "cauchy"])
 def test_robust_kernels_are_quadratic_then_slow(kernel: str) -> None:
     r = torch.tensor([1e-3, -1e-3, 100.0, 200.0], dtype=F64)
     value = robust(r, kernel, 1.5)
     torch.testing.assert_close(value[:2], 0.5 * r[:2] ** 2, rtol=1e-6, atol=0)
     growth = float(value[3] - value[2])
-    expected = {"huber": 1.5 * 100, "cauchy": 1.5**2 * math.log(2)}[kernel]
+    expected = {"quadratic": 15000, "huber": 1.5 * 100, "cauchy": 1.5**2 * math.log(2)}[kernel]
     assert growth == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.parametrize("kernel", ["quadratic", "huber", "cauchy"])
+def test_the_penalty_of_a_vector_is_that_of_its_length(kernel: str) -> None:
+    x = torch.tensor([[0.0, 0, 0], [0.3, -0.4, 0], [6.0, 0, 8]], dtype=F64, requires_grad=True)
+    value = penalties.robust_norm(x, kernel)
+    torch.testing.assert_close(value, robust(torch.tensor([0, 0.5, 10], dtype=F64), kernel, 2.0))
+    (g,) = torch.autograd.grad(value.sum(), x)
+    torch.testing.assert_close(g[:2], x[:2].detach(), rtol=0.1 if kernel == "cauchy" else 1e-9, atol=0)
+    assert bool((g[0] == 0).all()) and float(torch.linalg.cross(g[2], x[2]).detach().norm()) < 1e-12
+
+
 def test_an_unknown_kernel_is_an_error() -> None:
-    with pytest.raises(ValueError, match="huber or cauchy"):
+    with pytest.raises(ValueError, match="quadratic, huber or cauchy"):
         robust(torch.ones(1), "l2", 1.0)
 
 
@@ -220,6 +289,10 @@ def test_derivatives_match_finite_differences() -> None:
     check = torch.autograd.gradcheck
     assert check(lambda t: penalties.rotation(pose(t), prior), (twist,))
     assert check(lambda t: penalties.translation(pose(t), prior), (twist,))
+    sigma = torch.tensor([0.3, 0.5, 4.0], dtype=F64)
+    for kernel in ("quadratic", "huber", "cauchy"):
+        assert check(lambda t, k=kernel: penalties.rotation_uncertain(pose(t), prior, sigma, k), (twist,))
+        assert check(lambda t, k=kernel: penalties.translation_uncertain(pose(t), prior, sigma, k), (twist,))
     leaf = predicted.clone().requires_grad_(True)
     confidence = (1 + torch.rand_like(predicted)).requires_grad_(True)
     assert check(lambda d: penalties.depth(d, other, mask), (leaf,))
@@ -228,6 +301,7 @@ def test_derivatives_match_finite_differences() -> None:
     other_K = 1.1 * K.detach()
     assert check(lambda k: penalties.focal(k, other_K), (K,))
     assert check(lambda k: penalties.intrinsics_reference(k, other_K), (K,))
+    assert check(lambda k: penalties.focal_uncertain(k, other_K, sigma), (K,))
     for kernel in ("huber", "cauchy"):
         config = SparseDepthConfig(kernel=kernel)
         seen = points([[1.3, 2.7], [4.9, 0.6], [3.3, 3.3]], [1.5, 1.51, 1.2])

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from tco.geometry import matrix_from_quat, pixel_grid, project, rays, rigid, so3_exp
-from tco.surfels import SurfelConfig, from_depth
+from tco.surfels import Adjustment, SurfelConfig, from_depth
 
 PARITY = Path(__file__).parents[3] / "shared" / "parity" / "tco_losses.npz"
 K = torch.tensor([[20.0, 0, 6], [0, 24.0, 5], [0, 0, 1]], dtype=torch.float64)
@@ -64,6 +64,23 @@ def test_opacity_can_ignore_confidence() -> None:
     depth, _ = plane([0.0, 0, -1])
     surfels = from_depth(*inputs(depth), config=SurfelConfig(confident_opacity=False))
     assert bool((surfels.opacities == 1).all())
+
+
+def test_adjustments_scale_and_turn_surfels_in_their_own_frames() -> None:
+    args = inputs(plane([0.4, 0.1, -1])[0])
+    zero = Adjustment(torch.zeros(*SIZE, 2).double(), torch.zeros(*SIZE, 3).double())
+    plain, same = from_depth(*args), from_depth(*args, adjust=zero)
+    torch.testing.assert_close(same.scales, plain.scales)
+    torch.testing.assert_close(same.quats, plain.quats)
+    angle = 0.3
+    zero.radii[..., 1] = np.log(2)
+    zero.turn[..., 2] = angle  # about the normal
+    other = from_depth(*args, adjust=zero)
+    torch.testing.assert_close(other.scales, plain.scales * torch.tensor([1.0, 2.0]).double())
+    before, after = matrix_from_quat(plain.quats), matrix_from_quat(other.quats)
+    torch.testing.assert_close(after[..., 2], before[..., 2])
+    torch.testing.assert_close(after[..., 0], np.cos(angle) * before[..., 0] + np.sin(angle) * before[..., 1])
+    torch.testing.assert_close(other.means, plain.means)
 
 
 def test_scaling_the_scene_scales_the_surfels() -> None:

@@ -1,0 +1,246 @@
+"""Change a sign, a factor or half a pixel, and see which test notices.
+
+    python -m benchmarks.mutations [--only surfels,kernels] [--output docs/mutations.md]
+
+Each mutation is a textual change of one place, applied to a copy of the tree, on which the test files of that
+module are run until the first failure. A mutation that no test notices is a gap in the tests, and the command
+then ends with status 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True)
+class Mutation:
+    """``old``, which occurs in a file, becomes ``new``; ``tests`` should notice."""
+
+    file: str
+    old: str
+    new: str
+    tests: tuple[str, ...]
+
+
+def _of(file: str, tests: str, *changes: tuple[str, str]) -> list[Mutation]:
+    names = tuple(f"tests/tco/test_{name}.py" for name in tests.split())
+    return [Mutation(file, old, new, names) for old, new in changes]
+
+
+MUTATIONS = [
+    *_of(
+        "tco/geometry.py",
+        "geometry",
+        ("device=like.device) + 0.5,\n        torch", "device=like.device),\n        torch"),
+        ("ray = (xy - centre) / f", "ray = (xy - centre + 0.5) / f"),
+        ("return xy * f + K", "return xy * f - K"),
+        ("-Rt @ t", "Rt @ t"),
+        ("0.5 - theta2 / 24", "0.5 + theta2 / 24"),
+        ("(1 - torch.cos(theta)) / theta**2", "(1 - torch.cos(theta)) / theta"),
+        ("return s, my - s * mx", "return s, my + s * mx"),
+        ("align_corners=False", "align_corners=True"),
+        ("h - f, c - g, d - b,\n        h - f", "h - f, c - g, b - d,\n        h - f"),
+    ),
+    *_of(
+        "tco/surfels.py",
+        "surfels",
+        ("+ (config.pixel_centre - 0.5)", "+ config.pixel_centre"),
+        ("up = -down", "up = down"),
+        ("torch.linalg.cross(normal, t_u)", "torch.linalg.cross(t_u, normal)"),
+        ("radii = config.radius_factor * torch.cat", "radii = 2 * config.radius_factor * torch.cat"),
+        ("radii * normal[..., 2:].abs()", "radii / normal[..., 2:].abs()"),
+        ("1 - 1 / confidence.clamp_min(1 + 1e-6)", "1 / confidence"),
+        ("quat_from_matrix(world_from_cam[:3, :3] @", "quat_from_matrix(world_from_cam[:3, :3].T @"),
+        ("keep[:, :-1] &= valid[:, 1:]", "keep[:, :-1] &= valid[:, :-1]"),
+        ("frame @ so3_exp(adjust.turn)", "so3_exp(adjust.turn) @ frame"),
+    ),
+    *_of(
+        "tco/render/project.py",
+        "render",
+        ("w.new_tensor([1.0, 1.0, -1.0])", "w.new_tensor([1.0, 1.0, 1.0])"),
+        ("[..., :2] * surfels.scales.unsqueeze(-2)", "[..., :2] * surfels.scales.unsqueeze(-1)[..., :2, :]"),
+        ("r2 = 2 * torch.log", "r2 = torch.log"),
+        ("centres - filtered) - 0.51", "centres - filtered) + 0.51"),
+        ("depths > near", "depths > -near"),
+    ),
+    *_of(
+        "tco/render/kernels.py",
+        "render",
+        ("row[6]), -(box[0] + 0.5), W)", "row[6]), -box[0], W)"),
+        ("row[10] - box[2] - 0.5, limit", "row[10] - box[2], limit"),
+        ("filtered = 2 * (dx * dx + dy * dy)", "filtered = dx * dx + dy * dy"),
+        ("min(row[12] * math.exp(-0.5 * s), MAX", "min(row[12] * math.exp(-s), MAX"),
+        ("g_alpha = left[1] * value - left[0]", "g_alpha = left[1] * value + left[0]"),
+        ("dW = _add(_cross(gx, Y), 1, _cross(X, gy))", "dW = _add(_cross(gx, Y), -1, _cross(X, gy))"),
+        ("-(corner[0] + 0.5), dX)", "-corner[0], dX)"),
+        ("grad[10] += g_alpha * alpha * 2 * (y - my)", "grad[10] += g_alpha * alpha * (y - my)"),
+        ("grad[9] += value * weight * 2 * (x - mx)", "grad[9] -= value * weight * 2 * (x - mx)"),
+        ("if s <= 2 * CORE:", "if s <= CORE:"),
+        ("if not abs(row[11] - near) < tolerance * near:", "if not abs(row[11] - near) < tolerance:"),
+    ),
+    *_of(
+        "tco/render/twin.py",
+        "render",
+        ("offset = pixels.unsqueeze(1) -", "offset = pixels.unsqueeze(1) + 0.5 -"),
+        ("return 0.5 * torch.minimum((uv**2).sum(-1)", "return torch.minimum((uv**2).sum(-1)"),
+    ),
+    *_of(
+        "tco/penalties.py",
+        "penalties",
+        ("invert(world_from_cam[:1]) @ world_from_cam", "world_from_cam @ invert(world_from_cam[:1])"),
+        ("dim2=-1).sum(-1) - 1) / 2", "dim2=-1).sum(-1) - 1)"),
+        (".norm(dim=-1).sum() / len(centres)", ".norm(dim=-1).sum() / (len(centres) - 1)"),
+        ("(2 * (error[0, 0] + error[1, 1])", "((error[0, 0] + error[1, 1])"),
+        ("confidence[mask].log()).mean()", "confidence[mask].log()).sum()"),
+        ("return inverse * sparse.depth - 1, inside", "return 1 - inverse * sparse.depth, inside"),
+        ("xy = torch.minimum(sparse.xy.clamp_min(0.5)", "xy = torch.minimum(0.5 + sparse.xy.clamp_min(0.5)"),
+        ("robust(error / sigma, config.kernel", "robust(error * sigma, config.kernel"),
+        ("(points.sigma**2 + config.sigma_floor**2)", "(points.sigma**2 - config.sigma_floor**2).abs()"),
+        ("0.5 * threshold**2 * torch.log1p", "threshold**2 * torch.log1p"),
+        ("robust(angle / (sigma[1:] ** 2 + sigma[0] ** 2).sqrt()", "robust(angle / sigma[1:]"),
+        ("(scale * ours - theirs) / variance.sqrt()", "(scale * ours - theirs) / variance"),
+        ("/ _focals(prior)).log() / sigma", "/ _focals(prior)).log() * sigma"),
+    ),
+    *_of(
+        "tco/objective.py",
+        "objective",
+        ("limit = (1 + config.occlusion_tolerance)", "limit = (1 - config.occlusion_tolerance)"),
+        ("counted = rendered.depth.detach() <= limit", "counted = rendered.depth.detach() >= limit"),
+        ("(weight * error).sum() / weight.sum()", "(weight * error).mean()"),
+        ("color / rendered.alpha.clamp_min", "color * rendered.alpha.clamp_min"),
+        ("return gain, mean_image - gain * mean_color", "return gain, mean_image + gain * mean_color"),
+        ("(1 - config.structure) * error +", "error +"),
+        ("error = error + (ours - theirs).abs()", "error = error + 2 * (ours - theirs).abs()"),
+        ("error = (z[inside] * inverse - 1).abs()", "error = (z[inside] / inverse - 1).abs()"),
+        ("trust = 1 - 1 / context", "trust = 1 / context"),
+        ("invert(cameras.world_from_cam[chosen]) @", "cameras.world_from_cam[chosen] @"),
+    ),
+    *_of(
+        "tco/corrections.py",
+        "corrections",
+        ("pose[:, :3, :3] @ so3_exp(self.turn * rotation", "pose[:, :3, :3] @ so3_exp(-self.turn * rotation"),
+        ("t = pose[:, :3, 3] + self.shift", "t = pose[:, :3, 3] - self.shift"),
+        ("torch.exp(self.zoom * focal)\n", "torch.exp(2 * self.zoom * focal)\n"),
+        ("torch.stack([factor, factor, torch.ones_like(factor)]", "torch.stack([factor, factor, factor]"),
+        (".sum(0).mean()", ".sum()"),
+    ),
+    *_of(
+        "tco/lora.py",
+        "lora",
+        ("(b * scale).to(x.dtype)", "b.to(x.dtype)"),
+        ("inner(x, weight + delta", "inner(x, weight - delta"),
+        ("tensor.copy_(value)", "pass"),
+    ),
+    *_of(
+        "tco/schedule.py",
+        "schedule",
+        ("odds[source] = 0", "odds[source] = 1"),
+        ("odds.fill_diagonal_(0)", "pass"),
+        ("key=lambda view: view not in drawn", "key=lambda view: view in drawn"),
+        ("self.best, self.waited = average, 0", "self.best = average"),
+    ),
+    *_of(
+        "tco/optimize.py",
+        "toy optimize",
+        ("self.active, self.best_loss = tuple(weights), math.inf", "self.active = tuple(weights)"),
+        ("number >= c.consistency_start * c.steps", "number > c.consistency_start * c.steps + 1"),
+        ("is None else self.corrections()", "is None else self.given"),
+        ("return self.corrections.pixels(", "return 0.0 * self.corrections.pixels("),
+        ("if weight > 0}", "}"),
+        ("if loss < self.best_loss:", "if loss > self.best_loss:"),
+        ("self.sparse[s][shown] for", "self.sparse[s][~shown] for"),
+        ("+ 2 * translation(pose", "+ 3 * translation(pose"),
+    ),
+    *_of("tco/options.py", "toy", ("        3e-4,\n", "        1.0,\n")),
+]  # fmt: skip
+
+
+def copy_tree(work: Path) -> None:
+    """What the tests need, in a folder beside a link to the published numbers."""
+    for name in ("tco", "colmap_tco", "tests", "training", "benchmarks"):
+        shutil.copytree(ROOT / name, work / "tree" / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", work / "tree")
+    shared = ROOT.parent / "shared"
+    if shared.is_dir():
+        os.symlink(shared, work / "shared")
+
+
+def first_failure(tree: Path, mutation: Mutation) -> str | None:
+    """Name of the first test that fails, None if all pass.
+
+    Raises:
+        SystemExit: the tests could not be run at all.
+    """
+    options = ["-q", "-x", "--no-header", "-p", "no:cacheprovider"]
+    # Compiled code is found by the date of its file, which a change within a second may not alter.
+    cache = tree / (f"cache-{time.monotonic_ns()}" if "kernels" in mutation.file else "cache")
+    variables = {**os.environ, "NUMBA_CACHE_DIR": str(cache), "PYTHONDONTWRITEBYTECODE": "1"}
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", *options, *mutation.tests],
+        cwd=tree, capture_output=True, text=True, check=False, env=variables,
+    )  # fmt: skip
+    if done.returncode == 0:
+        return None
+    found = re.search(r"^(?:FAILED|ERROR) \S*?(test_\w+\.py\S*)", done.stdout, re.MULTILINE)
+    if done.returncode != 1 or not found:
+        sys.exit(f"the tests could not be run:\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}")
+    return found[1]
+
+
+def code(text: str) -> str:
+    """Text as code in a cell of a Markdown table."""
+    line = " ".join(text.split()).replace("|", "\\|")
+    return f"`{line}`"
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--only", default="", help="parts of file names, separated by commas")
+    parser.add_argument("--output", type=Path, default=None, help="Markdown file to write, else the terminal")
+    args = parser.parse_args()
+    wanted = [word for word in args.only.split(",") if word]
+    chosen = [m for m in MUTATIONS if not wanted or any(word in m.file for word in wanted)]
+    rows, missed = [], 0
+    with tempfile.TemporaryDirectory() as folder:
+        copy_tree(Path(folder))
+        tree = Path(folder) / "tree"
+        for mutation in chosen:
+            path = tree / mutation.file
+            original = path.read_text(encoding="utf-8")
+            if mutation.old not in original:
+                sys.exit(f"{mutation.file} does not hold {mutation.old!r} any more: adapt the list")
+            path.write_text(original.replace(mutation.old, mutation.new, 1), encoding="utf-8")
+            caught = first_failure(tree, mutation)
+            path.write_text(original, encoding="utf-8")
+            missed += caught is None
+            change = f"{code(mutation.old)} | {code(mutation.new)}"
+            rows.append(f"| {mutation.file} | {change} | {caught or '**not noticed**'} |")
+            sys.stderr.write(rows[-1] + "\n")
+    text = (
+        f"# Mutations\n\n`python -m benchmarks.mutations`: {len(chosen) - missed} of {len(chosen)} changes "
+        "are noticed; the first test that fails is named.\n\n"
+        "| file | from | to | noticed by |\n|---|---|---|---|\n"
+    )
+    text += "\n".join(rows) + "\n"
+    if args.output is None:
+        sys.stdout.write(text)
+    else:
+        args.output.parent.mkdir(parents=True, exist_ok=True)
+        args.output.write_text(text, encoding="utf-8")
+    sys.exit(1 if missed else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,185 @@
+"""The published schedule against ours on one real set: seconds a step, memory, loss, time to the same loss.
+
+    python -m benchmarks.tco_step [--sets livingroom] [--output docs/tco_step.md]
+
+Both lower the same objective with the same network. The published schedule draws a source uniformly, encodes
+and decodes all views with gradients in every step, and renders into all other views. Each schedule runs in a
+process of its own. The loss that is compared is neither's own: after every few steps the photometric term is
+evaluated for every view into its three best partners, with all depths of that moment, off the clock.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+from multiprocessing import get_context
+from typing import Any
+
+import torch
+from torch import nn
+
+from benchmarks.real import RealSet, arguments, load, publish, within
+from tco.backbones.base import Backbone
+from tco.backbones.weights import EMBEDDED, load_sweep
+from tco.objective import NothingVisibleError, ObjectiveConfig, photometric
+from tco.optimize import optimize
+from tco.options import TCOConfig
+from tco.surfels import from_depth
+from tco.types import Prediction, Priors, SparseDepth, Views
+
+
+class Uncached:
+    """A backbone that keeps nothing between steps: whatever is asked, it starts from the pixels."""
+
+    def __init__(self, inner: Backbone) -> None:
+        self.inner = inner
+        self.name, self.stride, self.uses_cameras = inner.name, inner.stride, inner.uses_cameras
+
+    def encode(self, views: Views, priors: Priors) -> tuple[Views, Priors, Mapping[int, SparseDepth]]:
+        return views, priors, {}
+
+    def with_points(self, encoded: Any, points: Mapping[int, SparseDepth]) -> Any:
+        return (*encoded[:2], points)
+
+    def decode(
+        self, encoded: Any, views: Sequence[int] | None = None, context: Prediction | None = None
+    ) -> Prediction:
+        pictures, priors, points = encoded
+        features = self.inner.encode(pictures, priors)
+        if points:
+            features = self.inner.with_points(features, points)
+        return self.inner.decode(features, views, context)
+
+    def decoder(self) -> nn.Module:
+        return self.inner.decoder()
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Seconds and loss every some steps; the process's peak memory in MiB; share within 5 % at the end."""
+
+    every: int
+    seconds: list[float]
+    loss: list[float]
+    memory: float
+    accuracy: float
+
+    @property
+    def per_step(self) -> float:
+        """Seconds a step."""
+        return self.seconds[-1] / (self.every * (len(self.seconds) - 1))
+
+
+def common_loss(real: RealSet, prediction: Prediction) -> float:
+    """Photometric term of every view into its three best partners, mean."""
+    cameras, overlap = real.given.cameras, real.given.overlap
+    assert cameras is not None and overlap is not None
+    values = []
+    for source in range(len(real.views)):
+        targets = overlap[source].topk(min(3, len(real.views) - 1)).indices
+        surfels = from_depth(
+            prediction.depth[source], cameras.K[source], cameras.world_from_cam[source],
+            real.views.images[source], prediction.confidence[source], valid=real.views.valid[source],
+        )  # fmt: skip
+        try:
+            value = photometric(
+                surfels, real.views.images[targets], cameras[targets], prediction.depth[targets],
+                real.views.valid[targets], ObjectiveConfig(exposure=True, structure=0.5),
+            )  # fmt: skip
+        except NothingVisibleError:
+            continue
+        values.append(float(value))
+    return sum(values) / len(values)
+
+
+def measure(name: str, args: argparse.Namespace, reference: bool) -> Curve:
+    """One schedule on one set."""
+    torch.set_num_threads(args.threads)
+    real, network = load(name, args.size, args.views), load_sweep(args.weights or EMBEDDED)
+    # Fixed cameras: the loss that is compared is that of the depths.
+    config = TCOConfig(steps=args.steps, camera_rate=0)
+    backbone: Backbone = network
+    if reference:
+        config, backbone = config.reference_schedule(), Uncached(network)
+    with torch.no_grad():
+        features = network.encode(real.views, real.given)
+    seconds, loss, paused = [0.0], [common_loss(real, _depths(network, features))], 0.0
+    every = max(1, args.steps // 8)
+    start = time.perf_counter()
+
+    def report(step: int, _: dict[str, float]) -> None:
+        nonlocal paused
+        if (step + 1) % every:
+            return
+        now = time.perf_counter()
+        seconds.append(now - start - paused)
+        loss.append(common_loss(real, _depths(network, features)))
+        paused += time.perf_counter() - now
+
+    outcome = optimize(backbone, real.views, real.given, config, report=report)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return Curve(every, seconds, loss, peak, within(outcome.prediction, real.truth))
+
+
+@torch.no_grad()
+def _depths(network: Backbone, features: Any) -> Prediction:
+    return network.decode(features)
+
+
+def time_to(curve: Curve, loss: float) -> float | None:
+    """Seconds after which a curve has come down to a loss, interpolated; None if it never does."""
+    for (t0, a), (t1, b) in pairwise(zip(curve.seconds, curve.loss, strict=True)):
+        if b <= loss:
+            return t0 if a <= loss else t0 + (t1 - t0) * (a - loss) / (a - b)
+    return None
+
+
+def table(name: str, published: Curve, ours: Curve) -> str:
+    """Markdown of one set."""
+    goal = max(min(published.loss), min(ours.loss))
+    times = time_to(published, goal), time_to(ours, goal)
+    lines = [
+        f"## {name}\n",
+        "| schedule | s / step | peak MiB | loss at the start → end | within 5 % | seconds to loss "
+        f"{goal:.4f} |\n|---|---|---|---|---|---|",
+    ]
+    for label, curve, t in (("published", published, times[0]), ("ours", ours, times[1])):
+        lines.append(
+            f"| {label} | {curve.per_step:.2f} | {curve.memory:.0f} | {curve.loss[0]:.4f} → "
+            f"{curve.loss[-1]:.4f} | {curve.accuracy:.3f} | {'never' if t is None else f'{t:.0f}'} |"
+        )
+    if times[0] and times[1]:
+        lines.append(f"\n{times[0] / times[1]:.1f} times fewer seconds to the same loss.\n")
+    for label, curve in (("published", published), ("ours", ours)):
+        points = ", ".join(f"{t:.0f} s {v:.4f}" for t, v in zip(curve.seconds, curve.loss, strict=True))
+        lines.append(f"- {label}: {points}")
+    return "\n".join(lines) + "\n\n"
+
+
+def main() -> None:
+    """Command line."""
+    parser = arguments(__doc__ or "", ("livingroom",))
+    parser.set_defaults(sets=["livingroom"])
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    args = parser.parse_args()
+    text = (
+        f"# Published schedule and ours\n\n`python -m benchmarks.tco_step`: {args.views or 'all'} views of "
+        f"{args.size} pixels, {args.steps} steps, {args.threads} threads, the same objective and network. "
+        "Times on other machines differ; their ratio should not. Memory is the peak of the process.\n\n"
+    )
+    for name in args.sets:
+        curves = []
+        for reference in (True, False):
+            with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+                curves.append(pool.submit(measure, name, args, reference).result())
+        text += table(name, *curves)
+    publish(text, args.output)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,224 @@
+"""Which network runs: the one that was named, or the best that this machine can run now."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from colmap_tco.errors import MissingError
+from colmap_tco.memory import (
+    FEWEST_VIEWS,
+    Footprint,
+    canvas_pixels,
+    chunk_limit,
+    footprint,
+    free_memory,
+)
+from colmap_tco.published import NETWORKS, PUBLISHED, Network
+from colmap_tco.views import View
+from colmap_tco.weights import accepted, cached, gigabytes, located, require
+from tco.config import knob
+from tco.options import TCOConfig
+
+if TYPE_CHECKING:
+    import torch
+
+    from tco.backbones.base import Backbone
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """The network, and where it runs."""
+
+    backbone: str = knob(
+        "auto",
+        "network that predicts the depths. auto: vggt or pi3 where there is a CUDA device for it and its "
+        "weights were fetched (colmap-tco weights), else sweep, which is in the package",
+        choices=("auto", *NETWORKS),
+    )
+    weights: str = knob(
+        "",
+        "file of weights to use instead of those fetched or in the package; with auto it tells the network",
+    )
+    device: str = knob(
+        "auto", "auto: cuda if there is one, else cpu; or any name that torch knows, such as cuda:1"
+    )
+    chunk_size: int = knob(
+        0, "views that are optimised together; 0: as many as fit 70 % of the free memory, at most 40"
+    )
+
+
+class Selected(NamedTuple):
+    """A network to run.
+
+    Attributes:
+        network: the entry of the registry.
+        weights: its file.
+        device: where it runs.
+        reason: why this one, as a sentence for the user.
+    """
+
+    network: Network
+    weights: Path
+    device: torch.device
+    reason: str
+
+    def describe(self) -> dict[str, object]:
+        """For the report."""
+        c = self.network.checkpoint
+        return {
+            "name": self.network.name,
+            "reason": self.reason,
+            "weights": self.weights,
+            "licence": None if c is None else f"{c.licence}: {c.terms}",
+        }
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How many views a chunk may have.
+
+    Attributes:
+        needs: memory of the network, as it will be used.
+        pixels: of the canvas.
+        device: whose memory counts.
+        given: what the user asked for; 0: nothing.
+    """
+
+    needs: Footprint
+    pixels: int
+    device: torch.device
+    given: int
+
+    @classmethod
+    def of(cls, chosen: Selected, views: Sequence[View], config: NetworkConfig, steps: int) -> Budget:
+        """For these views, and so many steps of optimisation."""
+        needs = footprint(chosen.network.name, chosen.device.type, steps)
+        return cls(needs, canvas_pixels(views), chosen.device, config.chunk_size)
+
+    def views(self) -> int:
+        """Views a chunk to plan with."""
+        if self.given:
+            return max(FEWEST_VIEWS, self.given)
+        return chunk_limit(self.needs, self.pixels, free_memory(self.device))
+
+    def views_now(self) -> int:
+        """Views that fit at this moment, without the reserve of planning; what was asked for, if so."""
+        if self.given:
+            return max(FEWEST_VIEWS, self.given)
+        return max(FEWEST_VIEWS, int(self.needs.views(self.pixels, free_memory(self.device))))
+
+
+def choose_device(name: str) -> torch.device:
+    """The device that ``--device`` names.
+
+    Raises:
+        MissingError: it is not there.
+    """
+    import torch
+
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise MissingError(f"--device {name}: not usable here ({error}); try --device cpu") from error
+    return device
+
+
+def select(config: NetworkConfig) -> Selected:
+    """The network that a configuration means, with its weights found and looked at, but not read.
+
+    Raises:
+        MissingError: no such device, or weights that are missing, damaged or of another network.
+    """
+    device = choose_device(config.device)
+    file = Path(config.weights).expanduser() if config.weights else None
+    if config.backbone != "auto":
+        network = NETWORKS[config.backbone]
+        path, reason = file or located(network), f"--backbone {network.name}"
+    elif file is not None:
+        network, path = _owner(file), file
+        reason = f"{file} holds weights of {network.kind}"
+    else:
+        network, reason = _best(device)
+        path = located(network)
+    require(path, network)
+    return Selected(network, path, device, reason)
+
+
+def _owner(path: Path) -> Network:
+    """The network that a file of weights is of.
+
+    Raises:
+        MissingError: it is of none that is known.
+    """
+    from tco.backbones.identify import identify
+    from tco.backbones.weights import WeightsError
+
+    try:
+        found = identify(path)
+    except WeightsError as error:
+        raise MissingError(str(error)) from error
+    for network in NETWORKS.values():
+        if network.kind == found.network:
+            return network
+    raise MissingError(f"{path}: {found}; the networks are {', '.join(NETWORKS)}")
+
+
+def _best(device: torch.device) -> tuple[Network, str]:
+    """The network for ``auto``: a published one if weights, licence, device and memory allow, else sweep."""
+    ready = [name for name in PUBLISHED if cached(PUBLISHED[name][1]) and accepted(NETWORKS[name])]
+    sweep = NETWORKS["sweep"]
+    if not ready:
+        return sweep, f"auto: no weights of {' or '.join(PUBLISHED)} were fetched with their licence accepted"
+    if device.type != "cuda":
+        return sweep, (
+            f"auto: {' and '.join(ready)} could run, but take long without a CUDA device; "
+            f"--backbone {ready[0]} runs it all the same"
+        )
+    free = free_memory(device)
+    for name in ready:
+        network = NETWORKS[name]
+        need = footprint(name, device.type, steps=1).bytes(FEWEST_VIEWS, network.image_size**2)
+        if need < free:
+            return network, f"auto: fetched, and {gigabytes(free)} of {device} are enough for it"
+    return sweep, f"auto: {gigabytes(free)} free on {device} are too little for {' or '.join(ready)}"
+
+
+def load(selected: Selected) -> Backbone:
+    """The network on its device, frozen and in evaluation mode.
+
+    Raises:
+        MissingError: its file is not whole, or not what it says.
+    """
+    from tco.backbones.weights import WeightsError
+
+    network = selected.network
+    module, _, name = network.loader.partition(":")
+    loader: Callable[..., Backbone] = getattr(import_module(module), name)
+    try:
+        backbone = loader(selected.weights, device=selected.device)
+    except WeightsError as error:
+        raise MissingError(str(error)) from error
+    log.info(
+        "network %s (%s), weights %s; %s", network.name, network.title, selected.weights, selected.reason
+    )
+    if network.checkpoint is not None:
+        c = network.checkpoint
+        log.info("its weights are licensed %s: %s; %s", c.licence, c.terms, c.licence_url)
+    return backbone
+
+
+def suited(config: TCOConfig, network: Network) -> TCOConfig:
+    """The settings of optimisation, with the network's own where the user left the defaults."""
+    default = TCOConfig()
+    untouched = {f.name for f in fields(TCOConfig) if getattr(config, f.name) == getattr(default, f.name)}
+    return replace(config, **{name: value for name, value in network.tco.items() if name in untouched})

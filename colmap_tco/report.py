@@ -1,0 +1,61 @@
+"""What ``report.json`` says: every image, how good the depths are, and with which versions they were made."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+
+from colmap_tco import _pycolmap
+from colmap_tco.resume import Result
+from colmap_tco.views import View
+
+
+def view_table(
+    result: Result, used: Sequence[View], others: Mapping[str, Mapping[str, str]]
+) -> dict[str, Any]:
+    """Every image: used with its figures, or its other state (skipped, failed, unregistered) and why."""
+    table: dict[str, Any] = {v.name: {"state": "used", **result.views[v.name]} for v in used}
+    for state, reasons in others.items():
+        table.update({name: {"state": state, "why": why} for name, why in reasons.items()})
+    return dict(sorted(table.items()))
+
+
+def held_out(result: Result) -> dict[str, Any]:
+    """The user's quality figure: errors at points that neither network nor optimisation saw.
+
+    A result is plausible if its error (at points that were seen, where none was held out) is below half of
+    that of one depth for each view, or small enough to be one of a scene that has no relief.
+    """
+    rows: list[Any] = list(result.views.values())
+    held = [r for r in rows if r["points_held_out"]]
+    error = float(np.median([r["error_at_held_out"] for r in held] or [r["error_at_points"] for r in rows]))
+    flat = float(np.median([r["error_of_one_depth"] for r in rows]))
+    count = sum(r["points_held_out"] for r in held)
+    share = sum(r["held_out_within_5_percent"] * r["points_held_out"] for r in held) / max(count, 1)
+    return {
+        "points": count,
+        "median_error": error if held else None,
+        "within_5_percent": share if held else None,
+        "error": error,
+        "error_of_one_depth": flat,
+        "plausible": error < max(0.5 * flat, SMALL_ERROR),
+    }
+
+
+SMALL_ERROR = 0.02
+"""Relative depth error that is good in any scene."""
+
+
+def versions() -> dict[str, str]:
+    """Versions of everything that can change the result."""
+    found = {"python": platform.python_version(), "pycolmap": ".".join(map(str, _pycolmap.version()))}
+    for name in ("colmap-tco", "torch", "numpy", "opencv-python-headless", "numba"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed as a package"
+    return found

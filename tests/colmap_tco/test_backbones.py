@@ -1,0 +1,158 @@
+"""Which network runs, on which device, with which weights, and what is said when it cannot."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+from colmap_tco.backbones import NetworkConfig, Selected, _best, choose_device, load, select, suited
+from colmap_tco.errors import MissingError
+from colmap_tco.published import NETWORKS, PUBLISHED
+from colmap_tco.weights import _note_accepted, cached
+from tco.backbones.base import Backbone
+from tco.backbones.checkpoints import save
+from tco.backbones.dinov2 import ViTConfig
+from tco.backbones.pi3 import Pi3Config, Pi3Network
+from tco.backbones.vggt import VGGTConfig, VGGTNetwork
+from tco.backbones.weights import EMBEDDED
+from tco.options import TCOConfig
+
+VIT = ViTConfig(channels=48, depth=1, heads=2)
+TINY = {
+    "vggt": VGGTConfig(VIT, 48, 4, 2, 4, 1, 2, 8, (8, 8, 8, 8), (0, 1, 2, 3)),
+    "pi3": Pi3Config(ViTConfig(48, 1, 2, mask_token=False), 48, 4, 2, 5, 48, 1, 2, 32),
+}
+
+
+@pytest.fixture(autouse=True)
+def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No weights were fetched, whatever this machine has."""
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+def written(path: Path, kind: str) -> Path:
+    """A small network of a kind, as a checkpoint."""
+    torch.manual_seed(0)
+    config = TINY[kind]
+    save(path, VGGTNetwork(config) if isinstance(config, VGGTConfig) else Pi3Network(config), config)
+    return path
+
+
+@pytest.mark.parametrize("name", ["cuda:99", "tpu", "gpu please", "cpu:x"])
+def test_a_device_that_is_not_there_is_an_error_with_the_remedy(name: str) -> None:
+    with pytest.raises(MissingError, match=f"--device {name}: not usable here.*--device cpu"):
+        choose_device(name)
+
+
+def test_devices_are_found() -> None:
+    assert choose_device("cpu") == torch.device("cpu")
+    assert choose_device("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
+
+
+@pytest.mark.parametrize("backbone", ["auto", "sweep"])
+def test_weights_that_are_missing_or_foreign_are_an_error(tmp_path: Path, backbone: str) -> None:
+    def chosen(path: Path) -> Selected:
+        return select(NetworkConfig(backbone=backbone, weights=str(path), device="cpu"))
+
+    with pytest.raises(MissingError, match=r"none\.safetensors: no such file"):
+        chosen(tmp_path / "none.safetensors")
+    (tmp_path / "page.safetensors").write_text("<html>")
+    with pytest.raises(MissingError, match=r"page\.safetensors: this is a web page"):
+        chosen(tmp_path / "page.safetensors")
+    (tmp_path / "cut.safetensors").write_bytes(EMBEDDED.read_bytes()[:-100])
+    with pytest.raises(MissingError, match=r"cut\.safetensors: .* was cut off"):
+        chosen(tmp_path / "cut.safetensors")
+
+
+def test_the_network_in_the_package_needs_nothing_and_is_frozen() -> None:
+    chosen = select(NetworkConfig(device="cpu"))
+    assert chosen.network.name == "sweep" and chosen.weights == EMBEDDED
+    assert "no weights of vggt or vggt-commercial or pi3 were fetched with their lic" in chosen.reason
+    network = load(chosen)
+    assert isinstance(network, torch.nn.Module) and not network.training
+    assert not any(p.requires_grad for p in network.parameters())
+    assert chosen.describe()["licence"] is None
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_a_network_that_was_not_fetched_says_how_to(name: str) -> None:
+    with pytest.raises(MissingError, match=f"'colmap-tco weights fetch {name}' .* --weights"):
+        select(NetworkConfig(backbone=name, device="cpu"))
+
+
+def fetched(folder: Path, name: str) -> Path:
+    """A file of the published size, empty but for its length, where the hub's cache would have it."""
+    c = PUBLISHED[name][1]
+    path = folder / "hub" / f"models--{c.repository.replace('/', '--')}" / "snapshots" / c.revision / c.file
+    path.parent.mkdir(parents=True)
+    path.touch()
+    os.truncate(path, c.size)
+    return path
+
+
+def test_auto_needs_an_accepted_licence_and_a_fast_device(tmp_path: Path) -> None:
+    """What another program fetched is not used unasked; and without CUDA the package's network is better."""
+    cpu = torch.device("cpu")
+    path = fetched(tmp_path, "pi3")
+    assert cached(PUBLISHED["pi3"][1]) == path
+    network, reason = _best(cpu)
+    assert network.name == "sweep" and "were fetched" in reason
+    _note_accepted(*PUBLISHED["pi3"])
+    network, reason = _best(cpu)
+    assert network.name == "sweep"
+    assert "pi3 could run, but take long without a CUDA device; --backbone pi3 runs it" in reason
+    os.truncate(path, 1000)
+    assert cached(PUBLISHED["pi3"][1]) is None and "were fetched" in _best(cpu)[1]
+
+
+@pytest.mark.parametrize("kind", TINY)
+@pytest.mark.parametrize("backbone", ["auto", "named"])
+def test_a_file_of_weights_runs_the_network_that_it_is_of(tmp_path: Path, kind: str, backbone: str) -> None:
+    path = written(tmp_path / "mine.safetensors", kind)
+    asked = kind if backbone == "named" else "auto"
+    chosen = select(NetworkConfig(backbone=asked, weights=str(path), device="cpu"))
+    assert chosen.network.kind == kind and chosen.weights == path
+    assert chosen.reason == (
+        f"--backbone {kind}" if backbone == "named" else f"{path} holds weights of {kind}"
+    )
+    network = load(chosen)
+    assert isinstance(network, Backbone)
+    assert (network.stride, network.uses_cameras) == (chosen.network.stride, False)
+    assert str(chosen.describe()["licence"]).startswith("CC BY-NC 4.0: no commercial use")
+
+
+def test_weights_of_another_network_are_refused_before_they_are_read(tmp_path: Path) -> None:
+    path = written(tmp_path / "mine.safetensors", "pi3")
+    with pytest.raises(
+        MissingError, match=r"mine\.safetensors: weights of pi3, but --backbone vggt takes model"
+    ):
+        select(NetworkConfig(backbone="vggt", weights=str(path), device="cpu"))
+    with pytest.raises(MissingError, match="--backbone sweep takes those of the embedded network"):
+        select(NetworkConfig(backbone="sweep", weights=str(path), device="cpu"))
+
+
+def test_the_registry_agrees_with_the_networks(tmp_path: Path) -> None:
+    """Strides, and layers with adapters, are those of the code."""
+    from tco.lora import select as layers
+
+    for name, network in NETWORKS.items():
+        path = EMBEDDED if network.checkpoint is None else written(tmp_path / name, network.kind)
+        backbone = load(Selected(network, path, torch.device("cpu"), ""))
+        assert backbone.stride == network.stride and backbone.name == network.kind
+        config = suited(TCOConfig(), network)
+        assert layers(backbone.decoder(), config.lora_targets)
+
+
+def test_the_networks_own_settings_hold_where_the_user_gave_none() -> None:
+    vggt = NETWORKS["vggt"]
+    assert suited(TCOConfig(), NETWORKS["sweep"]) == TCOConfig()
+    assert suited(TCOConfig(), vggt).rate == 5e-4
+    mine = suited(TCOConfig(rate=3e-3, steps=7), vggt)
+    assert mine.rate == 3e-3 and mine.steps == 7
+    assert mine.lora_targets == ("qkv", "proj", "fc1", "fc2")
