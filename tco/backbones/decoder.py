@@ -89,7 +89,10 @@ class Volume(nn.Module):
         x1 = self.gates[1](self.down1(x0), context[1])
         x2 = self.gates[2](self.down2(x1), context[2])
         x2 = x2 + self._columns(x2, context[2])
-        x2 = self.out2(x2 + _resized(self.up2(self.down3(x2)), x2))
+        # oneDNN's gradient of a bfloat16 convolution over so few cells is not always finite (torch 2.13).
+        with torch.autocast(x2.device.type, enabled=False):
+            x3 = self.down3(x2.float() if x2.dtype == torch.bfloat16 else x2)
+        x2 = self.out2(x2 + _resized(self.up2(x3), x2))
         x1 = self.out1(x1 + _resized(self.up1(x2), x1))
         x0 = self.last(self.out0(x0 + _resized(self.up0(x1), x0)), context[0])
         return self.head(x0).squeeze(1).float()

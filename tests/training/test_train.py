@@ -21,7 +21,7 @@ from training.train import TrainConfig, Trainer, coarse_loss, fine_loss, losses,
 TINY = SweepConfig(
     planes=16, groups=(4, 2), coarse=16, fine=8, context=8, volume=6, tokens=32, heads=2, blocks=1, hidden=16
 )
-CONFIG = TrainConfig(steps=40, warmup=2, sizes=((0.0, 48, 64),), refined=1, held_out=1)
+CONFIG = TrainConfig(steps=40, warmup=2, sizes=((0.0, 96, 128),), refined=1, held_out=1)
 
 
 def tiny() -> Sweep:
@@ -31,7 +31,7 @@ def tiny() -> Sweep:
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("data")
-    write(folder, 0, 3, (48, 64), 4)
+    write(folder, 0, 3, (96, 128), 4)
     return folder
 
 
@@ -121,7 +121,7 @@ def test_the_fine_loss_is_lowest_where_the_expected_error_is_the_true_one() -> N
 
 
 def test_a_few_steps_lower_the_loss_of_a_sample(data: Path) -> None:
-    sample = load(data / "000001.npz", 4, (48, 64))
+    sample = load(data / "000001.npz", 4, (96, 128))
     assert sample is not None
     torch.manual_seed(0)
     net = tiny()
@@ -194,7 +194,7 @@ def test_a_run_ends_with_weights_that_the_package_loads(data: Path, tmp_path: Pa
 
 @pytest.mark.usefixtures("_small")
 def test_the_rate_warms_up_and_falls_to_a_fiftieth(data: Path, tmp_path: Path) -> None:
-    trainer = Trainer(TrainConfig(steps=100, rate=2.0, warmup=10), [data], tmp_path)
+    trainer = Trainer(TrainConfig(steps=100, rate=2.0, warmup=10, held_out=1), [data], tmp_path)
     rates = []
     for trainer.step in range(101):
         rates.append(trainer.rate())
