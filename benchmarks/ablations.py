@@ -26,6 +26,7 @@ def variants(decoder: nn.Module, plain: TCOConfig) -> Iterator[tuple[str, TCOCon
     """Names and configurations."""
     layers = list(select(decoder, ("*",)))
     last = layers[-1].split(".")[0]
+    heads = [name for name, _ in decoder.named_modules() if name.split(".")[-1].endswith("head")]
     slow = replace(plain, rate=plain.rate / 10)
 
     def ablation(config: TCOConfig = plain, **changes: object) -> TCOConfig:
@@ -36,7 +37,7 @@ def variants(decoder: nn.Module, plain: TCOConfig) -> Iterator[tuple[str, TCOCon
     for rank in (1, 16):
         yield f"rank {rank}", replace(plain, lora_rank=rank)
     yield f"adapters on the last part only ({last})", replace(plain, lora_targets=(f"{last}.*",))
-    yield f"head trained in full, too ({layers[-1]})", ablation(slow, unfrozen=(layers[-1],))
+    yield "heads trained in full, too", ablation(slow, unfrozen=tuple(heads or layers[-1:]))
     yield "decoder trained in full, no adapters", ablation(replace(slow, lora_targets=()), unfrozen=("*",))
     yield (
         "depths of pixels instead of the network",

@@ -28,12 +28,12 @@ ROOT = Path(__file__).resolve().parents[1]
 TABLE = ROOT / "colmap_tco" / "_footprints.py"
 SIZES = {
     "sweep": ((4, 128, 96), (10, 128, 96), (4, 256, 192), (12, 256, 192), (4, 512, 384), (9, 512, 384)),
-    "vggt": ((2, 112, 84), (5, 112, 84), (2, 196, 140), (4, 196, 140)),
-    "pi3": ((2, 112, 84), (5, 112, 84), (2, 196, 140), (4, 196, 140)),
+    "vggt": ((2, 84, 56), (5, 84, 56), (2, 168, 126), (4, 168, 126)),
+    "pi3": ((2, 84, 56), (5, 84, 56), (2, 168, 126), (4, 168, 126)),
 }
 """(views, width, height) that are measured by default."""
-MODES = {"forward": 0, "optimised": 2}
-"""Steps; two are enough to pass every place that allocates, when depths are computed anew in each."""
+MODES = {"forward": 0, "optimised": 1}
+"""Steps; one passes every place that allocates, where the views are tied to each other from the first."""
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,7 @@ def run(backbone: Any, tracks: Any, views: list[Any], device: Any, steps: int) -
     from colmap_tco.published import NETWORKS
     from tco.options import TCOConfig
 
-    tco = suited(TCOConfig(steps=steps, refresh=1), NETWORKS[backbone.name])
+    tco = suited(TCOConfig(steps=steps, consistency_start=0.0), NETWORKS[backbone.name])
     settings = (PriorConfig(), tco, 0)
     predict_chunk(
         (backbone, device), tracks, views, Chunk(tuple(range(len(views)))), settings, lambda _: None

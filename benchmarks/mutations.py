@@ -10,14 +10,15 @@ then ends with status 1.
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import re
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -179,23 +180,42 @@ def copy_tree(work: Path) -> None:
 def first_failure(tree: Path, mutation: Mutation) -> str | None:
     """Name of the first test that fails, None if all pass.
 
+    The tests run in a fork of this process, which has loaded what takes long to load.
+
     Raises:
         SystemExit: the tests could not be run at all.
     """
-    options = ["-q", "-x", "--no-header", "-p", "no:cacheprovider"]
+    log = tree / "log.txt"
+    process = get_context("fork").Process(target=_run_tests, args=(tree, mutation, log))
+    process.start()
+    process.join()
+    if process.exitcode == 0:
+        return None
+    text = log.read_text(encoding="utf-8")
+    found = re.search(r"^(?:FAILED|ERROR) \S*?(test_\w+\.py\S*)", text, re.MULTILINE)
+    if process.exitcode != 1 or not found:
+        sys.exit(f"the tests could not be run:\n{text[-2000:]}")
+    return found[1]
+
+
+def _run_tests(tree: Path, mutation: Mutation, log: Path) -> None:
+    """In the fork: run the tests of a mutation in the copy, and end with pytest's status."""
+    import pytest
+
     # Compiled code is found by the date of its file, which a change within a second may not alter.
     cache = tree / (f"cache-{time.monotonic_ns()}" if "kernels" in mutation.file else "cache")
-    variables = {**os.environ, "NUMBA_CACHE_DIR": str(cache), "PYTHONDONTWRITEBYTECODE": "1"}
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", *options, *mutation.tests],
-        cwd=tree, capture_output=True, text=True, check=False, env=variables,
-    )  # fmt: skip
-    if done.returncode == 0:
-        return None
-    found = re.search(r"^(?:FAILED|ERROR) \S*?(test_\w+\.py\S*)", done.stdout, re.MULTILINE)
-    if done.returncode != 1 or not found:
-        sys.exit(f"the tests could not be run:\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}")
-    return found[1]
+    os.environ["NUMBA_CACHE_DIR"] = str(cache)
+    sys.dont_write_bytecode = True
+    os.chdir(tree)
+    sys.path[:] = [str(tree), *(entry for entry in sys.path if entry not in ("", str(ROOT)))]
+    for name in [name for name in sys.modules if name.split(".")[0] == "benchmarks"]:
+        del sys.modules[name]
+    with log.open("w", encoding="utf-8") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+        status = pytest.main(["-q", "-x", "--no-header", "-p", "no:cacheprovider", *mutation.tests])
+        sys.stdout.flush()
+    os._exit(int(status))
 
 
 def code(text: str) -> str:
@@ -212,6 +232,8 @@ def main() -> None:
     args = parser.parse_args()
     wanted = [word for word in args.only.split(",") if word]
     chosen = [m for m in MUTATIONS if not wanted or any(word in m.file for word in wanted)]
+    # Loaded once, for all forks: a single thread, which a fork can take along.
+    importlib.import_module("torch").set_num_threads(1)
     rows, missed = [], 0
     with tempfile.TemporaryDirectory() as folder:
         copy_tree(Path(folder))

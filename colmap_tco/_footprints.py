@@ -6,9 +6,5 @@ PROCESS = 500e6
 FITS: dict[tuple[str, str, str], tuple[float, float, float]] = {
     ("sweep", "cpu", "forward"): (520e6, 300.0, 3000.0),
     ("sweep", "cpu", "optimised"): (520e6, 300.0, 6000.0),
-    ("vggt", "cpu:bfloat16", "forward"): (5.4e9, 2000.0, 5000.0),
-    ("vggt", "cpu:bfloat16", "optimised"): (5.4e9, 10000.0, 10000.0),
-    ("pi3", "cpu:bfloat16", "forward"): (4.5e9, 2000.0, 5000.0),
-    ("pi3", "cpu:bfloat16", "optimised"): (4.5e9, 10000.0, 10000.0),
 }
 """(network, device, forward or optimised) → bytes fixed, bytes a pixel and view, bytes a pixel."""

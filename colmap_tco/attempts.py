@@ -65,7 +65,7 @@ def within_memory(
             yield Attempt(chunk, result)
             continue
         release()
-        if len(chunk.views) == 2:
+        if len(chunk.views) <= 2:
             log.error("two views do not fit the memory (%s)", why)
             yield Attempt(chunk, None, f"out of memory even with one other view ({why})")
             continue

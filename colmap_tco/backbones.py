@@ -39,7 +39,8 @@ class NetworkConfig:
     backbone: str = knob(
         "auto",
         "network that predicts the depths. auto: vggt or pi3 where there is a CUDA device for it and its "
-        "weights were fetched (colmap-tco weights), else sweep, which is in the package",
+        "weights were fetched (colmap-tco weights), else sweep, which is in the package. vggt and pi3 adapt "
+        "qkv, proj, fc1, fc2 at a rate of 5e-4 where lora_targets and rate are left alone",
         choices=("auto", *NETWORKS),
     )
     weights: str = knob(

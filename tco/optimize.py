@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from tco.backbones.base import Backbone
+from tco.context import Freshness, detached, merged
 from tco.corrections import CameraCorrections
 from tco.free import FreePixels
 from tco.lora import LoRAConfig, adapted
@@ -118,12 +119,14 @@ class _Run:
         self.encoded, self.context, self.generator = encoded, context, generator
         self.given, self.overlap, self.sparse = priors.cameras, priors.overlap, priors.sparse
         self.encoded_cameras = priors.cameras
-        self.age = [0] * len(views)
+        self.freshness = Freshness(len(views), config.refresh, config.lazy_refresh)
         self.corrections = CameraCorrections(priors) if config.camera_rate > 0 else None
         a = config.ablation
         self.free = FreePixels(context.depth, a.free_depth, a.free_surfels)
         self.sources = Sources(a.source_order, priors.overlap, generator)
-        self.stagnation = Stagnation(len(views), config.stop_after) if config.stop_after > 0 else None
+        self.stagnation = (
+            Stagnation(len(views), config.stop_after * config.sources) if config.stop_after else None
+        )
         self.objective = ObjectiveConfig(
             occlusion_tolerance=config.occlusion_tolerance,
             exposure=config.exposure,
@@ -186,10 +189,12 @@ class _Run:
         sources = self.sources.draw(self.config.sources)
         terms = self._terms(number, sources, weights)
         hidden = terms.pop("hidden", None)
-        if not terms:
-            self.history.append({"loss": 0.0})
+        loss = torch.stack(
+            [weights[name] * value for name, value in terms.items()] or [torch.zeros(())]
+        ).sum()
+        if not loss.requires_grad:
+            self.history.append({"loss": float(loss)})
             return self.history[-1]
-        loss = torch.stack([weights[name] * value for name, value in terms.items()]).sum()
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.config.clip)
@@ -198,9 +203,8 @@ class _Run:
             "loss": float(loss.detach()),
         }
         self._update(number, figures["loss"], bool(torch.isfinite(norm)))
-        if hidden is not None and self.stagnation is not None:
+        if hidden is not None:
             figures["hidden"] = float(hidden)
-            self.stopped = self.stagnation.add(sources[0], figures["hidden"])
         self.history.append(figures)
         return figures
 
@@ -264,7 +268,7 @@ class _Run:
         views = None if self.config.ablation.decode_all else list(points)
         prediction = self._decode(encoded, views, self.context)
         if views is None:
-            self.context = _detached(prediction)
+            self.context = detached(prediction)
         return prediction
 
     def _decode(
@@ -275,22 +279,20 @@ class _Run:
     @torch.no_grad()
     def _refresh(self, number: int, needed: Iterable[int]) -> None:
         """Compute the context anew where it is too old, with corrected cameras if they went far."""
-        c = self.config
-        due = number > 0 and number % c.refresh == 0
-        if due and self._moved():
-            self.encoded_cameras = self.cameras()
-            self.encoded = self.backbone.encode(
-                self.views, replace(self.priors, cameras=self.encoded_cameras)
-            )
-            stale = list(range(len(self.views)))
-        elif c.lazy_refresh:
-            stale = sorted(v for v in needed if number - self.age[v] >= c.refresh)
-        else:
-            stale = list(range(len(self.views))) if due else []
+        anew = self.freshness.due(number) and self._reencode()
+        stale = list(range(len(self.views))) if anew else self.freshness.stale(number, needed)
         if stale:
-            self.context = _merged(self.context, self._decode(self.encoded, stale, self.context))
-            for view in stale:
-                self.age[view] = number
+            self.context = merged(self.context, self._decode(self.encoded, stale, self.context))
+            self.freshness.renew(stale, number)
+
+    @torch.no_grad()
+    def _reencode(self) -> bool:
+        """Give the network the corrected cameras if they went far since it was given any; True if so."""
+        if not self._moved():
+            return False
+        self.encoded_cameras = self.cameras()
+        self.encoded = self.backbone.encode(self.views, replace(self.priors, cameras=self.encoded_cameras))
+        return True
 
     def _moved(self) -> bool:
         """Whether the network should be given the corrected cameras."""
@@ -308,6 +310,7 @@ class _Run:
             terms["sparse"] = sparse_depth(depth, points)
         if self.stagnation is not None and not bool(shown.all()):
             terms["hidden"] = sparse_depth(depth.detach(), points[~shown])
+            self.stopped |= self.stagnation.add(source, float(terms["hidden"]))
         return terms
 
     def _camera_penalty(self, cameras: Cameras) -> Tensor:
@@ -349,6 +352,7 @@ class _Run:
     def outcome(self) -> Outcome:
         """Predict all views with the adapted network, as the best step had it if the last ruined it."""
         with torch.no_grad():
+            self._reencode()
             prediction = self._decode(self.encoded, context=self.context)
             if not bool(torch.isfinite(prediction.depth).all()):
                 logger.warning("the last step gave depths that are not finite; back to the best state")
@@ -356,25 +360,13 @@ class _Run:
                 prediction = self._decode(self.encoded, context=self.context)
             cameras = self.cameras()
         cameras = Cameras(cameras.world_from_cam.detach(), cameras.K.detach())
-        prediction = _detached(prediction)
+        prediction = detached(prediction)
         sizes = {} if self.corrections is None else self.corrections.sizes()
         return Outcome(prediction, cameras, sizes, self.history, tuple(self.rolled_back))
 
 
 FEWEST_POINTS = 4
 """A view keeps at least this many points as input when others are hidden."""
-
-
-def _detached(prediction: Prediction) -> Prediction:
-    depth, confidence = prediction.depth.detach(), prediction.confidence.detach()
-    return replace(prediction, depth=depth, confidence=confidence)
-
-
-def _merged(every: Prediction, part: Prediction) -> Prediction:
-    """The prediction of all views with some of them replaced."""
-    depth, confidence, views = every.depth.clone(), every.confidence.clone(), list(part.views)
-    depth[views], confidence[views] = part.depth, part.confidence
-    return replace(every, depth=depth, confidence=confidence)
 
 
 def _means(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:

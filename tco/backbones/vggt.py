@@ -119,17 +119,15 @@ class Aggregator(nn.Module):
         own = rotary(grid, 1 + c.registers, c.channels // c.heads, x.device)
         common = own.repeated(views)
         index = torch.tensor(list(chosen), device=x.device)
-        dense: dict[int, Tensor] = {}
-        both = x
+        both: dict[int, Tensor] = {}
+        frame = x
         for i in range(c.depth):
             frame = run_block(self.frame_blocks[i], x, own, i in recompute)
             x = self._over_all(i, frame, common, i in recompute)
-            if i in c.layers:
-                both = torch.cat([frame[index], x[index]], -1)
-                dense[i] = both[:, 1 + c.registers :]
-        both = torch.cat([frame[index], x[index]], -1)
-        camera = torch.cat([frame[:, 0], x[:, 0]], -1)
-        return Features(camera, tuple(dense[i] for i in c.layers), both)
+            if i in c.layers or i == c.depth - 1:
+                both[i] = torch.cat([frame[index], x[index]], -1)
+        dense = tuple(both[i][:, 1 + c.registers :] for i in c.layers)
+        return Features(torch.cat([frame[:, 0], x[:, 0]], -1), dense, both[c.depth - 1])
 
     def _over_all(self, i: int, x: Tensor, common: Rotary, recompute: bool) -> Tensor:
         every = run_block(self.global_blocks[i], x.flatten(0, 1).unsqueeze(0), common, recompute)

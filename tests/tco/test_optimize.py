@@ -256,6 +256,15 @@ def test_with_nothing_to_optimise_there_is_an_error(scene: Scene) -> None:
         optimize(Small(), views, priors, replace(SMALL, lora_targets=(), camera_rate=0))
 
 
+def test_a_step_whose_terms_cannot_change_is_no_failure(scene: Scene) -> None:
+    """Cameras alone may move, no view shares anything, and priors have no weight: nothing depends on them."""
+    views, priors, _ = scene
+    assert priors.overlap is not None
+    alone = replace(priors, overlap=torch.zeros_like(priors.overlap))
+    outcome = optimize(Small(), views, alone, replace(SMALL, lora_targets=(), camera_weight=0.0))
+    assert len(outcome.history) == SMALL.steps and outcome.rolled_back == ()
+
+
 def test_what_has_no_weight_is_not_computed(scene: Scene) -> None:
     """Depths of the other views that would end the optimisation are never looked at."""
     views, priors, _ = scene

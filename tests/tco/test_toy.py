@@ -161,7 +161,10 @@ def test_corrected_cameras_are_given_to_the_network(scene: Wall) -> None:
     before, after = (float(rotation_angle(p[1, :3, :3], truth[1, :3, :3])) for p in (seen[0], seen[-1]))
     assert after < 0.6 * before
     seen.clear()
-    optimize(Watched(TRUE), wrong.views, wrong.priors, replace(config, reencode=0.0))
+    optimize(Watched(TRUE), wrong.views, wrong.priors, replace(config, steps=8, refresh=100))
+    assert len(seen) == 2  # for the prediction at the end
+    seen.clear()
+    optimize(Watched(TRUE), wrong.views, wrong.priors, replace(config, steps=9, reencode=0.0))
     assert len(seen) == 1
 
 
