@@ -17,11 +17,10 @@ from tco.context import Freshness, detached, merged
 from tco.corrections import CameraCorrections
 from tco.free import FreePixels
 from tco.lora import LoRAConfig, adapted
-from tco.objective import NothingVisibleError, ObjectiveConfig, consistency, photometric
 from tco.options import TCOConfig
-from tco.penalties import focal, rotation, sparse_depth, translation
+from tco.penalties import sparse_depth
 from tco.schedule import Sources, Stagnation, draw_targets
-from tco.surfels import SurfelConfig, from_depth
+from tco.terms import COMPATIBILITY, Terms, means
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
 
 logger = logging.getLogger(__name__)
@@ -63,10 +62,13 @@ def optimize(
     it most; the difference in colour, the disagreement in depth, the error at triangulated points and
     the departure from the camera priors are lowered by Adam on low-rank adapters of the decoder.
 
+    Without cameras among the priors, a network that predicts them is adapted to find them: by dense depths
+    (``geometric_weight`` and ``depth_weight``), colours, or both.
+
     Args:
-        backbone: a network that takes cameras as input.
+        backbone: the network.
         views: V views on one canvas.
-        priors: cameras with uncertainties, sparse points, overlap.
+        priors: cameras with uncertainties, sparse points, overlap; or dense depth alone.
         config: settings; ``steps = 0`` predicts without adapting.
         seed: of all randomness.
         report: called after every step with its number and its terms.
@@ -113,26 +115,20 @@ class _Run:
         self, backbone: Backbone, views: Views, priors: Priors, config: TCOConfig,
         encoded: Any, context: Prediction, generator: torch.Generator,
     ) -> None:  # fmt: skip
-        if priors.cameras is None or priors.overlap is None or priors.sparse is None:
-            raise ValueError("optimisation needs cameras, overlap and sparse points as priors")
+        if priors.cameras is None and backbone.uses_cameras:
+            raise ValueError(f"{backbone.name} needs cameras, overlap and sparse points as priors")
         self.backbone, self.views, self.priors, self.config = backbone, views, priors, config
         self.encoded, self.context, self.generator = encoded, context, generator
-        self.given, self.overlap, self.sparse = priors.cameras, priors.overlap, priors.sparse
+        self.terms = Terms(views, priors, config)
         self.encoded_cameras = priors.cameras
-        self.freshness = Freshness(len(views), config.refresh, config.lazy_refresh)
-        self.corrections = CameraCorrections(priors) if config.camera_rate > 0 else None
+        movable = config.camera_rate > 0 and priors.cameras is not None
+        self.corrections = CameraCorrections(priors) if movable else None
         a = config.ablation
         self.free = FreePixels(context.depth, a.free_depth, a.free_surfels)
-        self.sources = Sources(a.source_order, priors.overlap, generator)
-        self.stagnation = (
-            Stagnation(len(views), config.stop_after * config.sources) if config.stop_after else None
-        )
-        self.objective = ObjectiveConfig(
-            occlusion_tolerance=config.occlusion_tolerance,
-            exposure=config.exposure,
-            structure=config.structure,
-        )
-        self.surfels = SurfelConfig(a.radius_factor, confident_opacity=a.confident_opacity)
+        self.freshness = Freshness(len(views), config.refresh, config.lazy_refresh)
+        self.sources = Sources(a.source_order, self.terms.overlap, generator)
+        patience = config.stop_after * config.sources
+        self.stagnation = Stagnation(len(views), patience) if patience else None
         self.history: list[dict[str, float]] = []
         self.rolled_back: list[int] = []
         self.stopped = False
@@ -163,31 +159,20 @@ class _Run:
         """The parameters and the context as they are now."""
         return [p.detach().clone() for p in self.parameters], self.context
 
-    def cameras(self) -> Cameras:
-        """The cameras as they are believed now."""
-        return self.given if self.corrections is None else self.corrections()
-
-    def weights(self, number: int) -> dict[str, float]:
-        """The weight of each term in a step; a term that is not here is not computed."""
-        c = self.config
-        every = {
-            "photometric": c.photometric_weight,
-            "consistency": c.consistency_weight if number >= c.consistency_start * c.steps else 0.0,
-            "sparse": c.sparse_weight,
-            "cameras": 0.0 if self.corrections is None else c.camera_weight,
-        }
-        if c.ablation.plain_cameras and self.corrections is not None:
-            every["cameras"] = 1.0
-        return {name: weight for name, weight in every.items() if weight > 0}
+    def cameras(self, prediction: Prediction) -> Cameras:
+        """The cameras as they are believed now: corrected, given, or, if none are known, predicted."""
+        if self.corrections is not None:
+            return self.corrections()
+        return prediction.cameras if self.priors.cameras is None else self.priors.cameras
 
     def step(self, number: int) -> dict[str, float]:
         """One step; returns its terms and their weighted sum."""
-        weights = self.weights(number)
+        weights = self.terms.weights(number, self.corrections is not None)
         if tuple(weights) != self.active:
             # Sums of other terms cannot be compared: the best loss so far is forgotten.
             self.active, self.best_loss = tuple(weights), math.inf
         sources = self.sources.draw(self.config.sources)
-        terms = self._terms(number, sources, weights)
+        terms = self._evaluate(number, sources, weights)
         hidden = terms.pop("hidden", None)
         loss = torch.stack(
             [weights[name] * value for name, value in terms.items()] or [torch.zeros(())]
@@ -230,39 +215,49 @@ class _Run:
         for p, kept in zip(self.parameters, values, strict=True):
             p.copy_(kept)
 
-    def _terms(self, number: int, sources: list[int], weights: Mapping[str, float]) -> dict[str, Tensor]:
+    def _evaluate(self, number: int, sources: list[int], weights: Mapping[str, float]) -> dict[str, Tensor]:
         """Named terms of a step, means over its sources; and ``hidden``, the error at hidden points."""
-        points = {source: self._hide(source) for source in sources}
-        compatible = weights.keys() & {"photometric", "consistency"}
-        chosen = {s: draw_targets(self.overlap, s, self.config.targets, self.generator) for s in sources}
-        per_source = []
-        cameras = self.cameras()
+        shown = {source: self._hide(source) for source in sources}
+        count, overlap = self.config.targets, self.terms.overlap
+        targets = {source: draw_targets(overlap, source, count, self.generator) for source in sources}
+        if not weights.keys() & COMPATIBILITY:
+            targets = {source: [] for source in sources}
+        prediction, parts = self.context, []
         if weights.keys() - {"cameras"}:
-            self._refresh(
-                number, {t for targets in chosen.values() for t in targets} if compatible else set()
-            )
-            prediction = self._predict(points)
+            self._refresh(number, {view for chosen in targets.values() for view in chosen})
+            prediction = self._predict(shown)
+        cameras = self.cameras(prediction)
+        if weights.keys() - {"cameras"}:
             for source in sources:
-                depth = prediction.depth[prediction.views.index(source)]
-                terms = self._point_terms(source, points[source], depth, weights)
-                if compatible and chosen[source]:
-                    terms |= self._compatibility(source, chosen[source], prediction, cameras, weights)
-                per_source.append(terms)
-        terms = _means(per_source)
-        if "cameras" in weights:
-            terms["cameras"] = self._camera_penalty(cameras)
+                adjust = self.free.adjustment(source)
+                part = self.terms.of_source(
+                    source, targets[source], prediction, self.context, cameras, weights, adjust
+                )
+                parts.append(part | self._watch(source, shown[source], prediction))
+        terms = means(parts)
+        if "cameras" in weights and self.corrections is not None:
+            terms["cameras"] = self.terms.of_cameras(self.corrections, cameras)
         return terms
+
+    def _watch(self, source: int, shown: Tensor, prediction: Prediction) -> dict[str, Tensor]:
+        """The error at the points that were hidden, if it decides when to stop."""
+        if self.stagnation is None or bool(shown.all()):
+            return {}
+        depth = prediction.depth[prediction.views.index(source)].detach()
+        hidden = sparse_depth(depth, self.terms.sparse[source][~shown])
+        self.stopped |= self.stagnation.add(source, float(hidden))
+        return {"hidden": hidden}
 
     def _hide(self, source: int) -> Tensor:
         """Which points of a view (N,) the network is shown in this step."""
-        points, share = self.sparse[source], self.config.point_dropout
+        points, share = self.terms.sparse[source], self.config.point_dropout
         shown = torch.rand(len(points), generator=self.generator).to(points.depth.device) >= share
         return shown if int(shown.sum()) >= FEWEST_POINTS else torch.ones_like(shown)
 
     def _predict(self, points: Mapping[int, Tensor]) -> Prediction:
         """Depths of the sources with a part of their points hidden; of all views if all are decoded."""
         encoded = self.encoded
-        kept = {s: self.sparse[s][shown] for s, shown in points.items() if not bool(shown.all())}
+        kept = {s: self.terms.sparse[s][shown] for s, shown in points.items() if not bool(shown.all())}
         if kept:
             encoded = self.backbone.with_points(encoded, kept)
         views = None if self.config.ablation.decode_all else list(points)
@@ -288,66 +283,18 @@ class _Run:
     @torch.no_grad()
     def _reencode(self) -> bool:
         """Give the network the corrected cameras if they went far since it was given any; True if so."""
-        if not self._moved():
+        if self.corrections is None or not self._moved(self.corrections):
             return False
-        self.encoded_cameras = self.cameras()
+        self.encoded_cameras = self.corrections()
         self.encoded = self.backbone.encode(self.views, replace(self.priors, cameras=self.encoded_cameras))
         return True
 
-    def _moved(self) -> bool:
+    def _moved(self, corrections: CameraCorrections) -> bool:
         """Whether the network should be given the corrected cameras."""
         limit = self.config.reencode
-        if self.corrections is None or limit == 0 or not self.backbone.uses_cameras:
+        if limit == 0 or not self.backbone.uses_cameras or self.encoded_cameras is None:
             return False
-        return self.corrections.pixels(self.encoded_cameras, float(self.context.depth.median())) > limit
-
-    def _point_terms(
-        self, source: int, shown: Tensor, depth: Tensor, weights: Mapping[str, float]
-    ) -> dict[str, Tensor]:
-        """Penalty on triangulated points, and the error at those that were hidden, if it is watched."""
-        terms, points = {}, self.sparse[source]
-        if "sparse" in weights and len(points):
-            terms["sparse"] = sparse_depth(depth, points)
-        if self.stagnation is not None and not bool(shown.all()):
-            terms["hidden"] = sparse_depth(depth.detach(), points[~shown])
-            self.stopped |= self.stagnation.add(source, float(terms["hidden"]))
-        return terms
-
-    def _camera_penalty(self, cameras: Cameras) -> Tensor:
-        """Departure from the cameras' priors."""
-        assert self.corrections is not None
-        if not self.config.ablation.plain_cameras:
-            return self.corrections.penalty(self.config.camera_kernel)
-        pose, given = cameras.world_from_cam, self.given.world_from_cam
-        return rotation(pose, given) + 2 * translation(pose, given) + 0.01 * focal(cameras.K, self.given.K)
-
-    def _compatibility(
-        self, source: int, targets: list[int], prediction: Prediction, cameras: Cameras,
-        weights: Mapping[str, float],
-    ) -> dict[str, Tensor]:  # fmt: skip
-        """Compatibility of one source with its targets, in colour and in depth; empty if nothing is seen."""
-        c, terms = self.config, {}
-        i = prediction.views.index(source)
-        depth = prediction.depth[i]
-        try:
-            if "photometric" in weights:
-                surfels = from_depth(
-                    depth, cameras.K[source], cameras.world_from_cam[source], self.views.images[source],
-                    prediction.confidence[i], valid=self.views.valid[source], config=self.surfels,
-                    adjust=self.free.adjustment(source),
-                )  # fmt: skip
-                terms["photometric"] = photometric(
-                    surfels, self.views.images[targets], cameras[targets], self.context.depth[targets],
-                    self.views.valid[targets], self.objective,
-                )  # fmt: skip
-            if "consistency" in weights:
-                terms["consistency"] = consistency(
-                    depth, cameras, source, targets, self.context, c.consistency_tolerance
-                )
-        except NothingVisibleError as error:
-            logger.warning("%s: no compatibility in this step: %s", self.views.names[source], error)
-            return {}
-        return terms
+        return corrections.pixels(self.encoded_cameras, float(self.context.depth.median())) > limit
 
     def outcome(self) -> Outcome:
         """Predict all views with the adapted network, as the best step had it if the last ruined it."""
@@ -358,7 +305,7 @@ class _Run:
                 logger.warning("the last step gave depths that are not finite; back to the best state")
                 self._roll_back(self.config.steps)
                 prediction = self._decode(self.encoded, context=self.context)
-            cameras = self.cameras()
+            cameras = self.cameras(prediction)
         cameras = Cameras(cameras.world_from_cam.detach(), cameras.K.detach())
         prediction = detached(prediction)
         sizes = {} if self.corrections is None else self.corrections.sizes()
@@ -367,12 +314,6 @@ class _Run:
 
 FEWEST_POINTS = 4
 """A view keeps at least this many points as input when others are hidden."""
-
-
-def _means(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
-    """Mean of each term over the parts that have it, in the order of their first appearance."""
-    names = dict.fromkeys(name for part in parts for name in part)
-    return {name: torch.stack([part[name] for part in parts if name in part]).mean() for name in names}
 
 
 def errors_at_points(prediction: Prediction, points: Sequence[SparseDepth]) -> list[Tensor]:

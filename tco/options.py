@@ -63,6 +63,12 @@ class TCOConfig:
     photometric_weight: float = knob(
         1.0, "weight of the colours of the rendered surfels; 0 switches rendering off"
     )
+    geometric_weight: float = knob(
+        0.0, "weight of the depths of the rendered surfels; 1 to find poses from known depths"
+    )
+    depth_weight: float = knob(
+        0.0, "weight of dense depths among the priors, after one scale and shift for all that is predicted"
+    )
     sparse_weight: float = knob(0.01, "weight of the triangulated points, in inverse depth")
     consistency_weight: float = knob(1.0, "weight of the agreement with the depths of the other views")
     camera_weight: float = knob(

@@ -255,6 +255,9 @@ def test_sparse_depth_in_closed_form() -> None:
     """Depth 2 everywhere; points at 2.02 (e = 0.01) and 2.2 (e = 0.1) with σ = √(0.012² + 0.005²) = 0.013."""
     depth = torch.full((8, 9), 2.0, dtype=F64)
     seen = points([[0.1, 7.9], [4.2, 3.3], [-1, 4], [9.5, 4]], [2.02, 2.2, 9, 9], 0.012)
+    error, inside = penalties.inverse_depth_error(depth, seen)
+    torch.testing.assert_close(error[:2], torch.tensor([0.01, 0.1], dtype=F64))
+    assert inside.tolist() == [True, True, False, False]
     k, e = 1.5, torch.tensor([0.01, 0.1], dtype=F64) / 0.013
     expected = float(0.5 * e[0] ** 2 + k * (e[1] - k / 2)) / 2
     assert float(penalties.sparse_depth(depth, seen)) == pytest.approx(expected)

@@ -1,0 +1,161 @@
+"""The named terms that a step lowers, each from what its source view predicts."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from tco import penalties
+from tco.corrections import CameraCorrections
+from tco.objective import NothingVisibleError, ObjectiveConfig, consistency, geometric, photometric
+from tco.options import TCOConfig
+from tco.surfels import Adjustment, SurfelConfig, Surfels, from_depth
+from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
+
+logger = logging.getLogger(__name__)
+
+COMPATIBILITY = frozenset({"photometric", "geometric", "consistency"})
+"""Terms that compare a view with others."""
+
+
+class Terms:
+    """Terms of the views of one chunk, with what is known of them.
+
+    Attributes:
+        sparse: triangulated points, one :class:`SparseDepth` a view, empty where there are none.
+        overlap: (V, V) how much views share; all alike where it is not known.
+    """
+
+    def __init__(self, views: Views, priors: Priors, config: TCOConfig) -> None:
+        """Check that every term that has a weight has its data.
+
+        Raises:
+            ValueError: it has not.
+        """
+        self.views, self.config, self.given, self.depth = views, config, priors.cameras, priors.depth
+        if config.depth_weight > 0 and priors.depth is None:
+            raise ValueError("depth_weight is set and there is no dense depth among the priors")
+        if self.given is None:
+            # Poses are wanted: the network's own are used, and there may be nothing but depth to go by.
+            self.sparse = priors.sparse or (_no_points(views.images),) * len(views)
+            alike = torch.ones(len(views), len(views)).fill_diagonal_(0)
+            self.overlap = alike if priors.overlap is None else priors.overlap
+        elif priors.sparse is None or priors.overlap is None:
+            raise ValueError("optimisation needs cameras, overlap and sparse points as priors")
+        else:
+            self.sparse, self.overlap = priors.sparse, priors.overlap
+        self.objective = ObjectiveConfig(
+            occlusion_tolerance=config.occlusion_tolerance,
+            exposure=config.exposure,
+            structure=config.structure,
+        )
+        a = config.ablation
+        self.surfels = SurfelConfig(a.radius_factor, confident_opacity=a.confident_opacity)
+
+    def weights(self, number: int, movable: bool) -> dict[str, float]:
+        """The weight of each term in a step; a term that is not here is not computed.
+
+        Args:
+            number: of the step.
+            movable: whether given cameras may move.
+        """
+        c = self.config
+        cameras = 1.0 if c.ablation.plain_cameras else c.camera_weight
+        every = {
+            "photometric": c.photometric_weight,
+            "geometric": c.geometric_weight,
+            "consistency": c.consistency_weight if number >= c.consistency_start * c.steps else 0.0,
+            "sparse": c.sparse_weight,
+            "depth": c.depth_weight,
+            "cameras": cameras if movable else 0.0,
+        }
+        return {name: weight for name, weight in every.items() if weight > 0}
+
+    def of_source(
+        self, source: int, targets: Sequence[int], prediction: Prediction, context: Prediction,
+        cameras: Cameras, weights: Mapping[str, float], adjust: Adjustment | None = None,
+    ) -> dict[str, Tensor]:  # fmt: skip
+        """Terms with a weight of one source view, those for which it has data.
+
+        Args:
+            source: index of the view, one of ``prediction.views``.
+            targets: views that it is compared with; none: it is compared with none.
+            prediction: differentiable.
+            context: prediction for all views, which is not.
+            cameras: of all views, as they are believed now.
+            weights: which terms are wanted.
+            adjust: changes of the surfels.
+        """
+        depth = prediction.depth[prediction.views.index(source)]
+        terms = {}
+        if "sparse" in weights and len(self.sparse[source]):
+            terms["sparse"] = penalties.sparse_depth(depth, self.sparse[source])
+        if "depth" in weights:
+            terms |= self._depth(prediction)
+        if not targets:
+            return terms
+        try:
+            terms |= self._compatibility(source, list(targets), prediction, context, cameras, weights, adjust)
+        except NothingVisibleError as error:
+            logger.warning("%s: no compatibility in this step: %s", self.views.names[source], error)
+        return terms
+
+    def _depth(self, prediction: Prediction) -> dict[str, Tensor]:
+        """Penalty of the dense prior on the views that were predicted, after one common scale and shift."""
+        assert self.depth is not None
+        chosen = list(prediction.views)
+        mask = (self.depth[chosen] > 0) & self.views.valid[chosen]
+        if int(mask.sum()) < 2:
+            return {}
+        return {"depth": penalties.depth(prediction.depth, self.depth[chosen], mask)}
+
+    def _compatibility(
+        self, source: int, targets: list[int], prediction: Prediction, context: Prediction,
+        cameras: Cameras, weights: Mapping[str, float], adjust: Adjustment | None,
+    ) -> dict[str, Tensor]:  # fmt: skip
+        """Compatibility of one source with its targets, in colour and in depth."""
+        terms, depth = {}, prediction.depth[prediction.views.index(source)]
+        there = context.depth[targets], self.views.valid[targets], self.objective
+        if weights.keys() & {"photometric", "geometric"}:
+            surfels = self._surfels(source, prediction, cameras, adjust)
+        if "photometric" in weights:
+            terms["photometric"] = photometric(surfels, self.views.images[targets], cameras[targets], *there)
+        if "geometric" in weights:
+            terms["geometric"] = geometric(surfels, cameras[targets], *there)
+        if "consistency" in weights:
+            tolerance = self.config.consistency_tolerance
+            terms["consistency"] = consistency(depth, cameras, source, targets, context, tolerance)
+        return terms
+
+    def _surfels(
+        self, source: int, prediction: Prediction, cameras: Cameras, adjust: Adjustment | None
+    ) -> Surfels:
+        i = prediction.views.index(source)
+        return from_depth(
+            prediction.depth[i], cameras.K[source], cameras.world_from_cam[source],
+            self.views.images[source], prediction.confidence[i],
+            valid=self.views.valid[source], config=self.surfels, adjust=adjust,
+        )  # fmt: skip
+
+    def of_cameras(self, corrections: CameraCorrections, cameras: Cameras) -> Tensor:
+        """Departure (scalar) of corrected cameras from what was given."""
+        if not self.config.ablation.plain_cameras:
+            return corrections.penalty(self.config.camera_kernel)
+        assert self.given is not None
+        pose, given = cameras.world_from_cam, self.given.world_from_cam
+        angle, centres = penalties.rotation(pose, given), penalties.translation(pose, given)
+        return angle + 2 * centres + 0.01 * penalties.focal(cameras.K, self.given.K)
+
+
+def means(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
+    """Mean of each term over the parts that have it, in the order of their first appearance."""
+    names = dict.fromkeys(name for part in parts for name in part)
+    return {name: torch.stack([part[name] for part in parts if name in part]).mean() for name in names}
+
+
+def _no_points(like: Tensor) -> SparseDepth:
+    none = like.new_zeros(0)
+    return SparseDepth(none.reshape(0, 2), none, none, none.long())

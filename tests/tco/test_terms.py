@@ -1,0 +1,132 @@
+"""Terms: a weight without its data is an error, depths ignore scale, and poses are found from depths."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tco.backbones.base import Backbone
+from tco.geometry import rigid, so3_exp
+from tco.optimize import optimize
+from tco.options import TCOConfig
+from tco.penalties import in_first_view, rotation_angle
+from tco.terms import Terms, means
+from tco.toy import Toy, Wall, wall
+from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
+
+
+@pytest.fixture(scope="module")
+def scene() -> Wall:
+    return wall(points=20)
+
+
+class Moving(nn.Module):
+    """A network that knows the depths and predicts the cameras: a twist of each that is not right."""
+
+    name, stride, uses_cameras = "moving", 1, False
+
+    def __init__(self, scene: Wall, degrees: float) -> None:
+        super().__init__()
+        assert scene.priors.cameras is not None
+        self.scene, self.true = scene, scene.priors.cameras
+        v = len(self.true)
+        self.twist = nn.Linear(v, 6, bias=False)
+        wrong = torch.randn(6, v, generator=torch.Generator().manual_seed(2))
+        wrong[:3] *= math.radians(degrees)
+        wrong[3:] *= 0.01
+        self.twist.weight = nn.Parameter(wrong)
+
+    def encode(self, views: Views, priors: Priors) -> None:
+        return None
+
+    def with_points(self, encoded: Any, points: Mapping[int, SparseDepth]) -> Any:
+        return encoded
+
+    def decode(
+        self, encoded: Any, views: Sequence[int] | None = None, context: Prediction | None = None
+    ) -> Prediction:
+        chosen = tuple(range(len(self.true))) if views is None else tuple(views)
+        twist = self.twist(torch.eye(len(self.true)))
+        pose = self.true.world_from_cam @ rigid(so3_exp(twist[:, :3]), twist[:, 3:])
+        depth = self.scene.depth[list(chosen)]
+        return Prediction(depth, torch.full_like(depth, 10.0), Cameras(pose, self.true.K), chosen)
+
+    def decoder(self) -> nn.Module:
+        return self
+
+
+def rotation_error(cameras: Cameras, scene: Wall) -> float:
+    assert scene.priors.cameras is not None
+    poses = (in_first_view(c.world_from_cam)[1:, :3, :3] for c in (cameras, scene.priors.cameras))
+    return math.degrees(float(rotation_angle(*poses).mean()))
+
+
+def test_poses_are_found_from_depths(scene: Wall) -> None:
+    """Nothing but dense depth is known: the cameras come from the network and make depths and colours agree.
+
+    On a plane the depths alone would leave turns about its normal and shifts along it.
+    """
+    network = Moving(scene, 0.7)
+    assert isinstance(network, Backbone)
+    config = TCOConfig(
+        steps=20, rate=1e-3, lora_targets=("twist",), consistency_weight=0, geometric_weight=1.0,
+        depth_weight=1.0, occlusion_tolerance=0.2,
+    )  # fmt: skip
+    outcome = optimize(network, scene.views, Priors(depth=scene.depth), config)
+    before = optimize(network, scene.views, Priors(depth=scene.depth), TCOConfig(steps=0))
+    assert outcome.corrections == {}
+    assert outcome.history[0].keys() == {"photometric", "geometric", "depth", "loss"}
+    assert rotation_error(outcome.cameras, scene) < 0.5 * rotation_error(before.cameras, scene)
+
+
+def test_a_weight_without_its_data_is_an_error(scene: Wall) -> None:
+    with pytest.raises(ValueError, match="no dense depth"):
+        Terms(scene.views, scene.priors, TCOConfig(depth_weight=1.0))
+    with pytest.raises(ValueError, match="overlap and sparse points"):
+        Terms(scene.views, replace(scene.priors, sparse=None), TCOConfig())
+    with pytest.raises(ValueError, match="toy needs cameras"):
+        optimize(Untold(), scene.views, Priors(depth=scene.depth), TCOConfig(steps=1))
+
+
+class Untold(Toy):
+    """Takes cameras, and has them from elsewhere."""
+
+    def encode(self, views: Views, priors: Priors) -> tuple[Tensor, Tensor, Cameras]:
+        return super().encode(views, wall().priors)
+
+
+def of_source(scene: Wall, depth: Tensor, prior: Tensor, /, **weights: float) -> dict[str, Tensor]:
+    assert scene.priors.cameras is not None
+    prediction = Prediction(depth, torch.full_like(depth, 10.0), scene.priors.cameras, (0, 1, 2, 3))
+    terms = Terms(scene.views, replace(scene.priors, depth=prior), TCOConfig(depth_weight=1.0))
+    return terms.of_source(1, [0, 2], prediction, prediction, scene.priors.cameras, weights)
+
+
+def test_dense_depth_is_compared_after_one_scale_and_shift(scene: Wall) -> None:
+    other = 3 * scene.depth + 0.2
+    other[:, :5] = 0  # not known there
+    assert float(of_source(scene, scene.depth, other, depth=1.0)["depth"]) < 1e-5
+    bent = scene.depth * (1 + 0.1 * torch.linspace(0, 1, 64))
+    assert float(of_source(scene, bent, other, depth=1.0)["depth"]) > 0.01
+    assert of_source(scene, bent, torch.zeros_like(other), depth=1.0) == {}
+
+
+def test_only_what_has_a_weight_is_there(scene: Wall) -> None:
+    names = ("photometric", "geometric", "consistency", "sparse", "depth")
+    for name in names:
+        assert of_source(scene, scene.depth, scene.depth, **{name: 0.3}).keys() == {name}
+    every = of_source(scene, scene.depth, scene.depth, **dict.fromkeys(names, 1.0))
+    assert every.keys() == set(names)
+    assert float(every["geometric"]) < 0.02 and float(every["consistency"]) < 1e-4
+
+
+def test_means_are_over_the_parts_that_have_a_term() -> None:
+    a, b, c = (torch.tensor(x) for x in (1.0, 3.0, 5.0))
+    assert means([{"x": a}, {"x": b, "y": c}]) == {"x": torch.tensor(2.0), "y": c}
+    assert means([]) == {}
