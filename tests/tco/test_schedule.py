@@ -80,6 +80,13 @@ def test_stagnation_waits_for_all_views_and_then_for_its_patience() -> None:
     assert flat.index(True) == 2
 
 
+def test_every_gain_starts_the_wait_anew() -> None:
+    """Two measurements without gain between any two with: never the three that it waits for."""
+    watch = Stagnation(1, patience=3)
+    errors = [5.0, 5.0, 5.0, 4.0, 4.0, 4.0, 3.0, 3.0, 3.0, 2.0]
+    assert not any(watch.add(0, error) for error in errors)
+
+
 def test_a_hard_view_after_an_easy_one_is_no_stagnation() -> None:
     """Errors of 1 and 9 that both fall: the later of two successive errors is often the larger one."""
     watch = Stagnation(2, patience=2)
