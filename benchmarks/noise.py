@@ -110,7 +110,8 @@ def main() -> None:
     lines = [
         "# Noise in the camera priors\n",
         f"`python -m benchmarks.noise`: {args.views or 'all'} views of {args.size} pixels, {args.steps} "
-        "steps. Share of measured pixels within 5 %; in brackets the mean error of relative rotations in degrees.\n",
+        "steps. Share of measured pixels within 5 %; in brackets the mean error of relative rotations in "
+        "degrees.\n",
         "| noise | " + " | ".join(head) + " |",
         "|---" * (len(head) + 1) + "|",
     ]
