@@ -37,11 +37,15 @@ class Freshness:
 def detached(prediction: Prediction) -> Prediction:
     """The prediction without its history of computation."""
     depth, confidence = prediction.depth.detach(), prediction.confidence.detach()
-    return replace(prediction, depth=depth, confidence=confidence)
+    stages = tuple(s.detach() for s in prediction.stages)
+    return replace(prediction, depth=depth, confidence=confidence, stages=stages)
 
 
 def merged(every: Prediction, part: Prediction) -> Prediction:
     """The prediction of all V views with those of ``part`` replaced; neither is changed."""
     depth, confidence, views = every.depth.clone(), every.confidence.clone(), list(part.views)
     depth[views], confidence[views] = part.depth, part.confidence
-    return replace(every, depth=depth, confidence=confidence)
+    stages = tuple(s.clone() for s in every.stages)
+    for whole, new in zip(stages, part.stages, strict=True):
+        whole[views] = new
+    return replace(every, depth=depth, confidence=confidence, stages=stages)

@@ -44,8 +44,8 @@ def _move(value: object, device: torch.device | str | None, dtype: torch.dtype |
         return value.to(device=device, dtype=dtype if value.is_floating_point() else None)
     if isinstance(value, _Movable):
         return value.to(device, dtype)
-    if isinstance(value, tuple) and value and isinstance(value[0], _Movable):
-        return tuple(item.to(device, dtype) for item in value)
+    if isinstance(value, tuple) and value and isinstance(value[0], (_Movable, torch.Tensor)):
+        return tuple(_move(item, device, dtype) for item in value)
     return value
 
 
@@ -146,9 +146,12 @@ class Prediction(_Movable):
         confidence: (V, H, W), at least 1.
         cameras: poses and intrinsics of all views of the chunk, predicted or passed through.
         views: V indices into the chunk, of the views whose depth this is.
+        stages: (V, …) tensors that the network wants to find in its next context: what its own stages
+            said of these views.
     """
 
     depth: Tensor
     confidence: Tensor
     cameras: Cameras
     views: tuple[int, ...]
+    stages: tuple[Tensor, ...] = ()

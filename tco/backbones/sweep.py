@@ -183,18 +183,30 @@ class Sweep(nn.Module):
     ) -> Prediction:
         """Depth and confidence of some views; see :class:`tco.backbones.base.Backbone`.
 
-        Without a context the other views' coarse depths are computed here, without gradients.
+        Each pass judges hypotheses by what the stage before says of the other views. If all views are
+        decoded that is computed here and a context is not needed; else it comes from the context's
+        ``stages``, or, without a context, the others' coarse depths are computed, without gradients.
         """
-        every = range(len(encoded.lo))
-        chosen = tuple(every if views is None else views)
+        every = tuple(range(len(encoded.lo)))
+        chosen = every if views is None else tuple(views)
         stage = self.coarse(encoded, chosen)
+        worlds = None if chosen == every else self._worlds(encoded, chosen, stage, context)
+        kept = []
+        for k in range(len(self.config.spacing)):
+            own = stage.detached() if k else stage.detached().doubled()
+            kept.append(torch.stack([own.inverse, own.log_error], 1))
+            stage = self.refine(k, encoded, chosen, stage, own if worlds is None else worlds[k])
+        confidence = expected_confidence(stage.log_error)
+        return Prediction(1 / stage.inverse, confidence, encoded.cameras, chosen, tuple(kept))
+
+    def _worlds(
+        self, encoded: Encoded, chosen: tuple[int, ...], stage: Stage, context: Prediction | None
+    ) -> list[Stage]:
+        """What each pass is told of all views."""
+        if context is not None and context.stages:
+            return [Stage(*kept.unbind(1)) for kept in context.stages]
         world = self._others(encoded, chosen, stage) if context is None else _world(context)
-        passes = len(self.config.spacing)
-        for k in range(passes):
-            stage = self.refine(k, encoded, chosen, stage, world)
-            if chosen == tuple(every) and k + 1 < passes:
-                world = stage.detached()
-        return Prediction(1 / stage.inverse, expected_confidence(stage.log_error), encoded.cameras, chosen)
+        return [world] * len(self.config.spacing)
 
     def _others(self, encoded: Encoded, chosen: tuple[int, ...], stage: Stage) -> Stage:
         """Coarse stages of all views at half resolution, those not chosen computed now."""

@@ -125,10 +125,7 @@ def test_depths_are_positive_and_finite_for_any_weights_and_images(seed: int, im
 def test_a_view_is_decoded_alike_alone_and_in_company(
     network: Sweep, encoded: Encoded, full: Prediction, chosen: Sequence[int]
 ) -> None:
-    """With the same context a view's depth does not depend on which others are asked for.
-
-    Decoding all views differs a little: their first pass replaces the context of the second.
-    """
+    """With the context of the same weights a view's depth does not depend on which others are asked for."""
     some = network.decode(encoded, chosen, full)
     assert some.views == tuple(chosen)
     assert len(some.cameras) == len(encoded.lo)
@@ -136,15 +133,23 @@ def test_a_view_is_decoded_alike_alone_and_in_company(
         alone = network.decode(encoded, [view], full)
         assert_mostly_equal(some.depth[i], alone.depth[0], 1e-4, 0.999)
         assert_mostly_equal(some.confidence[i], alone.confidence[0], 1e-3, 0.999)
-    everything = network.decode(encoded, context=full)
-    assert_mostly_equal(some.depth, everything.depth[list(chosen)], 0.01, 0.9)
+    assert_mostly_equal(some.depth, full.depth[list(chosen)], 1e-3, 0.999)
+    assert torch.equal(network.decode(encoded, context=some).depth, full.depth)
+
+
+def test_a_context_of_another_network_is_taken_by_its_depths(
+    network: Sweep, encoded: Encoded, full: Prediction
+) -> None:
+    plain = replace(full, stages=())
+    assert_mostly_equal(network.decode(encoded, [1], plain).depth[0], full.depth[1], 0.02, 0.9)
 
 
 def test_the_context_matters(network: Sweep, encoded: Encoded, full: Prediction) -> None:
     """Other views' depths are evidence: with wrong ones the result is another."""
-    wrong = replace(full, depth=0.9 * full.depth)
-    depth = network.decode(encoded, [2], wrong).depth[0]
-    assert ((depth / full.depth[2] - 1).abs() > 0.01).float().mean() > 0.1
+    stages = tuple(torch.stack([s[:, 0] / 0.9, s[:, 1]], 1) for s in full.stages)
+    for wrong in (replace(full, stages=stages), replace(full, depth=0.9 * full.depth, stages=())):
+        depth = network.decode(encoded, [2], wrong).depth[0]
+        assert ((depth / full.depth[2] - 1).abs() > 0.01).float().mean() > 0.1
 
 
 @pytest.mark.parametrize("scale", [4096.0, 0.25, 37.3])
