@@ -65,7 +65,7 @@ def _seen(u: float, v: float, z: float, h: int, w: int) -> bool:
 
 
 @njit(nogil=True, cache=True, fastmath=True, inline="always")
-def _taps(u: float, v: float, h: int, w: int) -> tuple[tuple[int, ...], tuple[float, ...]]:
+def _taps(u: float, v: float, h: int, w: int) -> tuple[tuple[int, ...], tuple[Any, ...]]:
     """The four pixels around a position, the border's repeated, and their bilinear weights."""
     u, v = min(max(u, 0.0), w - 1.0), min(max(v, 0.0), h - 1.0)
     x0, y0 = int(u), int(v)
@@ -119,7 +119,7 @@ def forward_kernel(channels: int, groups: int) -> Kernel:
                             c = q * G + g
                             to[g] += (wi * fi[c] + wj * fj[c] + wk * fk[c] + wn * fn[c]) * r[c] * scale
 
-    return forward  # type: ignore[no-any-return]
+    return forward
 
 
 @cache
@@ -162,7 +162,7 @@ def backward_kernel(channels: int, groups: int) -> Kernel:
                             for g in range(G):
                                 gf[q * G + g] += part * r[q * G + g] * up[g]
 
-    return backward  # type: ignore[no-any-return]
+    return backward
 
 
 class Maps(NamedTuple):
