@@ -95,5 +95,7 @@ def test_files_that_are_not_there_and_folders_and_foreign_archives(tmp_path: Pat
     with pytest.raises(WeightsError, match=r"pictures\.zip: "):
         identify(tmp_path / "pictures.zip")
     torch.save({"model": {"a": torch.zeros(1)}, "epoch": 3}, tmp_path / "training.pt")
-    with pytest.raises(WeightsError, match="expected a plain table of tensors by name, found model, epoch"):
+    with pytest.raises(
+        WeightsError, match="expected a plain table of tensors by name, found entries model, epoch"
+    ):
         identify(tmp_path / "training.pt")

