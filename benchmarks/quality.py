@@ -9,10 +9,10 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -22,35 +22,39 @@ COLUMNS = ("cover", "med", "d2", "d5", "f5", "acc", "comp", "points")
 
 
 def run(command: list[str]) -> tuple[str, float, float]:
-    """Output, seconds and peak resident gigabytes of a command.
+    """Output, seconds and peak resident gibibytes of a command.
 
     Raises:
         SystemExit: it failed; what it wrote is shown.
     """
     start = time.monotonic()
-    before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    peak = max(before, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
-    if done.returncode not in (0, 6):
-        sys.exit(f"{' '.join(command)} failed with {done.returncode}:\n{done.stdout}\n{done.stderr}")
-    return done.stdout, time.monotonic() - start, peak / 2**20
+    with tempfile.TemporaryFile("w+") as written:
+        process = subprocess.Popen(command, stdout=written, stderr=subprocess.STDOUT)
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        seconds = time.monotonic() - start
+        written.seek(0)
+        text = written.read()
+    if process.returncode not in (0, 6):
+        sys.exit(f"{' '.join(command)} failed with {process.returncode}:\n{text}")
+    return text, seconds, used.ru_maxrss / 2**20
 
 
-def scored(workspace: Path, *words: str) -> dict[str, float]:
-    """Figures of the shared scorer."""
-    text, _, _ = run([sys.executable, str(SHARED / "tools" / "score.py"), str(workspace), *words])
+def scored(workspace: Path, *words: str) -> tuple[dict[str, float], float]:
+    """Figures of the shared scorer, and its peak memory."""
+    text, _, peak = run([sys.executable, str(SHARED / "tools" / "score.py"), str(workspace), *words])
     figures: dict[str, float] = json.loads(text.splitlines()[-1])
-    return figures
+    return figures, peak
 
 
-def row(name: str, what: str, figures: dict[str, float], seconds: float) -> str:
+def row(name: str, what: str, figures: dict[str, float], seconds: float, peak: float) -> str:
     """A line of the table."""
     cells = [f"{figures[c]:.4g}" if figures.get(c) is not None else "" for c in COLUMNS]
-    return f"| {name} | {what} | " + " | ".join(cells) + f" | {seconds:.0f} |"
+    return f"| {name} | {what} | " + " | ".join(cells) + f" | {seconds:.0f} | {peak:.2f} |"
 
 
-def densified(name: str, steps: int, work: Path, rest: list[str]) -> tuple[dict[str, float], float]:
-    """Scores and seconds of our result on one set."""
+def densified(name: str, steps: int, work: Path, rest: list[str]) -> tuple[dict[str, float], float, float]:
+    """Scores, seconds and peak memory of our result on one set."""
     source, copy = SHARED / "data" / name, work / name
     if not copy.exists():
         shutil.copytree(source / "sparse", copy / "sparse")
@@ -66,11 +70,11 @@ def densified(name: str, steps: int, work: Path, rest: list[str]) -> tuple[dict[
         "--overwrite",
         *rest,
     ]
-    _, seconds, _ = run(command)
+    _, seconds, peak = run(command)
     kept = work / f"{name}-{steps}"
     shutil.rmtree(kept, ignore_errors=True)
     shutil.copytree(copy / "dense-tco", kept)
-    return scored(source, "--dense", str(kept)), seconds
+    return scored(source, "--dense", str(kept))[0], seconds, peak
 
 
 def main() -> None:
@@ -84,16 +88,20 @@ def main() -> None:
     args.work.mkdir(parents=True, exist_ok=True)
     out = sys.stdout
     out.write(
-        "| set | method | " + " | ".join(COLUMNS) + " | seconds |\n" + "|---" * (len(COLUMNS) + 3) + "|\n"
+        "| set | method | "
+        + " | ".join(COLUMNS)
+        + " | seconds | GiB |\n"
+        + "|---" * (len(COLUMNS) + 4)
+        + "|\n"
     )
     for name in args.sets:
         for baseline in args.baselines:
             half = ["--half"] if baseline == "patchmatch" else []
-            figures = scored(SHARED / "data" / name, "--baseline", baseline, *half)
-            out.write(row(name, baseline, figures, figures["seconds"]) + "\n")
+            figures, peak = scored(SHARED / "data" / name, "--baseline", baseline, *half)
+            out.write(row(name, baseline, figures, figures["seconds"], peak) + "\n")
         for steps in args.steps:
-            figures, seconds = densified(name, steps, args.work, rest)
-            out.write(row(name, f"colmap-tco, {steps} steps", figures, seconds) + "\n")
+            figures, seconds, peak = densified(name, steps, args.work, rest)
+            out.write(row(name, f"colmap-tco, {steps} steps", figures, seconds, peak) + "\n")
             out.flush()
 
 

@@ -53,7 +53,7 @@ class TrainConfig:
         held_out: samples with the lowest numbers, kept for validation.
     """
 
-    steps: int = 3400
+    steps: int = 3000
     rate: float = 1e-3
     warmup: int = 150
     sizes: tuple[tuple[float, int, int], ...] = ((0.0, 96, 128), (0.6, 144, 192), (0.9, 192, 256))
@@ -318,11 +318,11 @@ class Trainer:
             self.step += 1
             if figures is not None:
                 rows.append(figures)
-            if self.step % every == 0:
+            if self.step % every == 0 or self.finished:
                 self.refresh()
                 if self.rank == 0 and rows:
                     means = {k: float(np.mean([r[k] for r in rows])) for k in rows[0]}
-                    self.log("train", means, (time.monotonic() - start) / every)
+                    self.log("train", means, (time.monotonic() - start) / len(rows))
                     self.save()
                 rows, start = [], time.monotonic()
             if self.step % validation == 0 and self.rank == 0:

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from tco.backbones.decoder import Decoder, SweepConfig, convex_upsample, soft_argmax
 from tco.backbones.layers import FeatureNet
 from tco.backbones.sweeping import Hints, interpolate_points, inverse_range, relative_cameras
+from tco.backbones.transformer import compute_dtype
 from tco.backbones.warp import agree, correlate
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
 
@@ -75,16 +76,11 @@ def joined(stages: Sequence[Stage]) -> Stage:
 
 
 def mixed(device: torch.device) -> torch.autocast:
-    """Convolutions and products in bfloat16 where the device multiplies it natively, else in float32.
+    """Convolutions and products in bfloat16 where the device is faster in it, else in float32.
 
     Float64 is left alone, so that finite differences can be taken.
     """
-    if device.type == "cpu":
-        probes = (getattr(torch.cpu, name, None) for name in BF16_PROBES)
-        native = any(probe() for probe in probes if probe is not None)
-    else:
-        native = device.type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
-    return torch.autocast(device.type, torch.bfloat16, enabled=native)
+    return torch.autocast(device.type, torch.bfloat16, enabled=compute_dtype(device) == torch.bfloat16)
 
 
 def channels_last(module: nn.Module) -> None:
@@ -298,9 +294,6 @@ class Sweep(nn.Module):
             total, weights = total + weight * corr, weights + weight
         return (total / (weights + 1e-6)).permute(0, 3, 1, 2)
 
-
-BF16_PROBES = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
-"""Functions of ``torch.cpu`` that tell of native bfloat16 products; older versions of torch lack them."""
 
 BATCH = 400_000
 """Cells of correlation volumes that are computed at once: small views together, large ones alone."""

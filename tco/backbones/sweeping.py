@@ -1,7 +1,4 @@
-"""Plane sweeps: warping, group-wise correlation, fusion over sources, and sparse points as hypotheses.
-
-All functions are differentiable in features; geometry enters as constants.
-"""
+"""Geometry of plane sweeps: relative cameras, ranges of hypotheses, and sparse points as hints of them."""
 
 from __future__ import annotations
 

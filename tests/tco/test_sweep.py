@@ -38,19 +38,17 @@ def _no_gradients() -> Iterator[None]:
 @pytest.fixture(scope="module", autouse=True)
 def _full_precision() -> Iterator[None]:
     """Symmetries are tested without the rounding of bfloat16."""
-    kept, sweep.BF16_PROBES = sweep.BF16_PROBES, ()
+    kept, sweep.compute_dtype = sweep.compute_dtype, lambda _: torch.float32
     yield
-    sweep.BF16_PROBES = kept
+    sweep.compute_dtype = kept
 
 
-def test_reduced_precision_changes_little(network: Sweep, encoded: Encoded, full: Prediction) -> None:
-    """Wherever a processor multiplies bfloat16 natively the network does; here it is made to."""
-    before = sweep.BF16_PROBES
-    sweep.BF16_PROBES = ("is_available",)  # true of every processor
-    try:
-        got = network.decode(encoded)
-    finally:
-        sweep.BF16_PROBES = before
+def test_reduced_precision_changes_little(
+    network: Sweep, encoded: Encoded, full: Prediction, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a processor with bfloat16 computes by itself; here it is made to."""
+    monkeypatch.setattr(sweep, "compute_dtype", lambda _: torch.bfloat16)
+    got = network.decode(encoded)
     assert not torch.equal(got.depth, full.depth)
     assert_mostly_equal(got.depth, full.depth, 0.01, 0.95)
 
