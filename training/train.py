@@ -328,8 +328,6 @@ class Trainer:
             if self.step % validation == 0 and self.rank == 0:
                 self.log("valid", self.validate(), 0.0)
                 start = time.monotonic()
-        if self.rank == 0:
-            self.save()
 
     def log(self, kind: str, figures: dict[str, float], seconds: float) -> None:
         """Append a line to log.csv and to the log."""
