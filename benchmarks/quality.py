@@ -15,18 +15,24 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 SETS = ("kitchen", "office", "livingroom")
 COLUMNS = ("cover", "med", "d2", "d5", "f5", "acc", "comp", "points")
 
 
-def run(command: list[str]) -> tuple[str, float, float]:
-    """Output, seconds and peak resident gibibytes of a command.
+class Done(NamedTuple):
+    """A command that has ended: what it wrote, its exit code, seconds, peak resident gibibytes."""
 
-    Raises:
-        SystemExit: it failed; what it wrote is shown.
-    """
+    text: str
+    code: int
+    seconds: float
+    peak: float
+
+
+def measured(command: list[str]) -> Done:
+    """Run a command to its end, whatever that is."""
     start = time.monotonic()
     with tempfile.TemporaryFile("w+") as written:
         process = subprocess.Popen(command, stdout=written, stderr=subprocess.STDOUT)
@@ -34,17 +40,26 @@ def run(command: list[str]) -> tuple[str, float, float]:
         process.returncode = os.waitstatus_to_exitcode(status)
         seconds = time.monotonic() - start
         written.seek(0)
-        text = written.read()
-    if process.returncode not in (0, 6):
-        sys.exit(f"{' '.join(command)} failed with {process.returncode}:\n{text}")
-    return text, seconds, used.ru_maxrss / 2**20
+        return Done(written.read(), process.returncode, seconds, used.ru_maxrss / 2**20)
+
+
+def run(command: list[str]) -> Done:
+    """Run a command that must succeed, in whole or in part.
+
+    Raises:
+        SystemExit: it failed; what it wrote is shown.
+    """
+    done = measured(command)
+    if done.code not in (0, 6):
+        sys.exit(f"{' '.join(command)} failed with {done.code}:\n{done.text}")
+    return done
 
 
 def scored(workspace: Path, *words: str) -> tuple[dict[str, float], float]:
     """Figures of the shared scorer, and its peak memory."""
-    text, _, peak = run([sys.executable, str(SHARED / "tools" / "score.py"), str(workspace), *words])
-    figures: dict[str, float] = json.loads(text.splitlines()[-1])
-    return figures, peak
+    done = run([sys.executable, str(SHARED / "tools" / "score.py"), str(workspace), *words])
+    figures: dict[str, float] = json.loads(done.text.splitlines()[-1])
+    return figures, done.peak
 
 
 def row(name: str, what: str, figures: dict[str, float], seconds: float, peak: float) -> str:
@@ -53,12 +68,18 @@ def row(name: str, what: str, figures: dict[str, float], seconds: float, peak: f
     return f"| {name} | {what} | " + " | ".join(cells) + f" | {seconds:.0f} | {peak:.2f} |"
 
 
-def densified(name: str, steps: int, work: Path, rest: list[str]) -> tuple[dict[str, float], float, float]:
-    """Scores, seconds and peak memory of our result on one set."""
+def copied(name: str, work: Path) -> Path:
+    """A workspace with the model and the pictures of a shared set, in which a result may be written."""
     source, copy = SHARED / "data" / name, work / name
     if not copy.exists():
         shutil.copytree(source / "sparse", copy / "sparse")
         os.symlink(source / "images", copy / "images")
+    return copy
+
+
+def densified(name: str, steps: int, work: Path, rest: list[str]) -> tuple[dict[str, float], float, float]:
+    """Scores, seconds and peak memory of our result on one set."""
+    copy = copied(name, work)
     command = [
         sys.executable,
         "-m",
@@ -70,11 +91,11 @@ def densified(name: str, steps: int, work: Path, rest: list[str]) -> tuple[dict[
         "--overwrite",
         *rest,
     ]
-    _, seconds, peak = run(command)
+    done = run(command)
     kept = work / f"{name}-{steps}"
     shutil.rmtree(kept, ignore_errors=True)
     shutil.copytree(copy / "dense-tco", kept)
-    return scored(source, "--dense", str(kept))[0], seconds, peak
+    return scored(SHARED / "data" / name, "--dense", str(kept))[0], done.seconds, done.peak
 
 
 def main() -> None:
