@@ -3,9 +3,9 @@
     python -m benchmarks.rule_run [--networks vggt pi3] [--set office] [--work DIR] [-- FLAG …]
 
 Writes a checkpoint with the authors' names and shapes (5.0 and 3.8 GB; ``../shared/parity``), runs the
-command on a copy of a shared set with it, and prints a Markdown table: exit code, seconds, peak memory, which outputs
-are there, and what the run says of its quality. Weights made by a rule know nothing, so the run must say that
-the result contradicts COLMAP's points, and must not end with 0.
+command on a copy of a shared set with it, and prints a Markdown table: exit code, seconds, peak memory,
+which outputs are there, and what the run says of its quality. Weights made by a rule know nothing, so the
+run must say that the result contradicts COLMAP's points, and must not end with 0.
 """
 
 from __future__ import annotations
