@@ -63,8 +63,22 @@ def _surface(
     from tco.render.cpu import rasterize_surface
     from tco.render.project import project
 
-    focal = (cameras.K[:, 0, 0] * cameras.K[:, 1, 1]).sqrt()
-    return rasterize_surface(project(surfels, cameras, size, near), focal, size)
+    if surfels.means.device.type != "cpu":
+        return _surface_pairs(surfels, cameras, size, near)
+    return rasterize_surface(project(surfels, cameras, size, near), _focal(cameras), size)
+
+
+def _surface_pairs(
+    surfels: Surfels, cameras: Cameras, size: tuple[int, int], near: float = 0.01
+) -> tuple[Tensor, Tensor, Tensor]:
+    from tco.render.pairs import rasterize_pairs
+    from tco.render.project import project
+
+    return rasterize_pairs(project(surfels, cameras, size, near), _focal(cameras), size)
+
+
+def _focal(cameras: Cameras) -> Tensor:
+    return (cameras.K[:, 0, 0] * cameras.K[:, 1, 1]).sqrt()
 
 
 def _gsplat(
@@ -94,11 +108,13 @@ def _surface_twin(
 ENGINES: dict[str, Engine] = {
     "cpu": _cpu,
     "surface": _surface,
+    "surface_pairs": _surface_pairs,
     "gsplat": _gsplat,
     "twin": _twin,
     "surface_twin": _surface_twin,
 }
-"""``cpu`` and ``surface``: CPU threads, any device. ``gsplat``: CUDA. The twins: brute force, for tests."""
+"""``cpu``: CPU threads, any device. ``surface``: CPU threads, or ``surface_pairs`` where the surfels are on
+another device; that is tensor operations, on any. ``gsplat``: CUDA. The twins: brute force, for tests."""
 
 
 def render(

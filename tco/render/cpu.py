@@ -17,7 +17,7 @@ from torch import Tensor
 
 from tco.render import kernels
 from tco.render.kernels import Array
-from tco.render.project import Splats
+from tco.render.project import Splats, finished
 
 
 class _Blending(Protocol):
@@ -171,8 +171,4 @@ def rasterize_surface(splats: Splats, focal: Tensor, size: tuple[int, int]) -> t
         size: (H, W).
     """
     tolerances = [0.01 + 4 / f for f in focal.detach().cpu().tolist()]
-    color, depth, weight = _rasterize(_Surface(tolerances), splats, size)
-    # (1 − exp(−w)) / w tends to 1; where nothing is, the sums that it multiplies are 0.
-    alpha = 1 - torch.exp(-weight)
-    share = alpha / weight.clamp_min(1e-10)
-    return color * share.unsqueeze(-1), depth * share, alpha
+    return finished(*_rasterize(_Surface(tolerances), splats, size))

@@ -115,3 +115,14 @@ def _boxes(
     empty = (high <= low).any(-1, keepdim=True)
     box = torch.stack([low[..., 0], high[..., 0], low[..., 1], high[..., 1]], -1)
     return torch.where(empty, torch.zeros_like(box), box).to(torch.int32)
+
+
+def finished(color: Tensor, depth: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Sums over the surfels of a surface, (T, H, W, 3) and two (T, H, W), scaled so that they end at alpha.
+
+    Alpha is 1 − exp(−Σ w), and the weights are divided by their sum and multiplied by it.
+    """
+    alpha = 1 - torch.exp(-weight)
+    # Alpha / Σ w tends to 1; where nothing is, the sums that it multiplies are 0.
+    share = alpha / weight.clamp_min(1e-10)
+    return color * share.unsqueeze(-1), depth * share, alpha

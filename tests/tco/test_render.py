@@ -133,7 +133,10 @@ def gradients(
 
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize(("engine", "definition"), [("cpu", "twin"), ("surface", "surface_twin")])
+@pytest.mark.parametrize(
+    ("engine", "definition"),
+    [("cpu", "twin"), ("surface", "surface_twin"), ("surface_pairs", "surface_twin")],
+)
 def test_engines_agree_with_their_twins(name: str, dtype: torch.dtype, engine: str, definition: str) -> None:
     scene = SCENES[name]()
     ours, our_grads = gradients(scene, cameras(), engine, dtype)
@@ -162,7 +165,7 @@ def smooth() -> Surfels:
     return replace(s, opacities=0.4 + 0.1 * s.opacities, scales=s.scales + 5.0)
 
 
-@pytest.mark.parametrize("engine", ["twin", "cpu", "surface_twin", "surface"])
+@pytest.mark.parametrize("engine", ["twin", "cpu", "surface_twin", "surface", "surface_pairs"])
 def test_derivatives_match_finite_differences(engine: str) -> None:
     """Large surfels cover all pixels (no threshold is crossed); poses move on the group."""
     scene, cams = smooth(), cameras(2)
@@ -276,7 +279,15 @@ def test_nothing_nearer_than_the_near_plane_is_seen(engine: str) -> None:
     assert float(render(scene, cams, SIZE, engine, near=0.019).alpha.max()) > 0.3
 
 
-@pytest.mark.parametrize("engine", ["surface", "surface_twin"])
+def test_blocks_of_pairs_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = gradients(surfels(), cameras(), "surface_pairs")
+    monkeypatch.setattr("tco.render.pairs._BLOCK", 50)
+    parts = gradients(surfels(), cameras(), "surface_pairs")
+    for a, b in zip(whole[0] + whole[1], parts[0] + parts[1], strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("engine", ["surface", "surface_pairs", "surface_twin"])
 def test_tolerance_of_a_surface_is_that_of_a_slope_of_60_degrees(engine: str) -> None:
     """At focal length 15 surfels within 0.01 + 4 / 15 of the nearest depth are one surface."""
     for part, together in ((0.99, True), (1.01, False)):
