@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import resource
 import time
-from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -21,42 +20,16 @@ from multiprocessing import get_context
 from typing import Any
 
 import torch
-from torch import nn
 
 from benchmarks.real import RealSet, arguments, load, publish, within
+from benchmarks.uncached import Uncached
 from tco.backbones.base import Backbone
 from tco.backbones.weights import EMBEDDED, load_sweep
 from tco.objective import NothingVisibleError, ObjectiveConfig, photometric
 from tco.optimize import optimize
 from tco.options import TCOConfig
 from tco.surfels import from_depth
-from tco.types import Prediction, Priors, SparseDepth, Views
-
-
-class Uncached:
-    """A backbone that keeps nothing between steps: whatever is asked, it starts from the pixels."""
-
-    def __init__(self, inner: Backbone) -> None:
-        self.inner = inner
-        self.name, self.stride, self.uses_cameras = inner.name, inner.stride, inner.uses_cameras
-
-    def encode(self, views: Views, priors: Priors) -> tuple[Views, Priors, Mapping[int, SparseDepth]]:
-        return views, priors, {}
-
-    def with_points(self, encoded: Any, points: Mapping[int, SparseDepth]) -> Any:
-        return (*encoded[:2], points)
-
-    def decode(
-        self, encoded: Any, views: Sequence[int] | None = None, context: Prediction | None = None
-    ) -> Prediction:
-        pictures, priors, points = encoded
-        features = self.inner.encode(pictures, priors)
-        if points:
-            features = self.inner.with_points(features, points)
-        return self.inner.decode(features, views, context)
-
-    def decoder(self) -> nn.Module:
-        return self.inner.decoder()
+from tco.types import Prediction
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,47 @@
+"""The scripts that wait for a GPU run on a CPU at small size, so that no minute of one is lost to them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from benchmarks.gpu import network_steps, render_parity
+
+
+def cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.strip().strip("|").split("|")]
+
+
+@pytest.mark.parametrize("network", ["vggt", "pi3"])
+def test_network_steps(network: str, capsys: pytest.CaptureFixture[str]) -> None:
+    network_steps.main(
+        ["--device", "cpu", "--small", "--dtype", "float32", "--networks", network, "--views", "3", "4",
+         "--size", "42", "56", "--steps", "2"]
+    )  # fmt: skip
+    rows = [cells(line) for line in capsys.readouterr().out.splitlines() if line.startswith(f"| {network}")]
+    assert [(r[0], r[1]) for r in rows] == [
+        (f"{network}, published", "3"), (f"{network}, ours", "3"), (f"{network}, ours", "4")
+    ]  # fmt: skip
+    for r in rows:
+        # The colours were compared in the first and in the last step, and nothing was rolled back.
+        first, last = (float(x) for x in r[6].split("→"))
+        assert 0 < first < 1 and 0 < last < 1 and r[7] == "0"
+
+
+def test_points_of_the_made_scene_lie_on_its_wall() -> None:
+    views, priors = network_steps.scene(3, (42, 56), points=20)
+    assert priors.cameras is not None and priors.sparse is not None and len(views) == 3
+    for k, sparse in enumerate(priors.sparse):
+        K, pose = priors.cameras.K[k], priors.cameras.world_from_cam[k]
+        rays = torch.cat([sparse.xy, torch.ones(20, 1)], -1) @ K.inverse().T
+        world = (rays * sparse.depth.unsqueeze(-1)) @ pose[:3, :3].T + pose[:3, 3]
+        torch.testing.assert_close(world[:, 2], torch.full((20,), network_steps.DEPTH))
+
+
+def test_render_parity(capsys: pytest.CaptureFixture[str]) -> None:
+    """The tensor renderer agrees with the compiled one; gsplat says why it cannot run."""
+    render_parity.main(["--device", "cpu", "--size", "30", "40", "--views", "3"])
+    gsplat, pairs = (cells(line) for line in capsys.readouterr().out.splitlines()[-2:])
+    assert gsplat[:2] == ["gsplat", "cpu"] and ("gsplat" in gsplat[2] or "CUDA" in gsplat[2])
+    assert pairs[:2] == ["surface_pairs", "surface"]
+    assert all(float(cell) < 1e-4 for cell in pairs[2:9])
