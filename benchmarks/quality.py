@@ -1,6 +1,7 @@
 """Densify the shared real sets and score them against their sensors, beside what else one could run.
 
 ``python -m benchmarks.quality --steps 0 40 --baselines interp patchmatch`` prints a Markdown table.
+``--sets`` also takes the rendered scenes of ``benchmarks/rendered.py``, which are scored against their truth.
 Workspaces are copied to ``--work`` first; the shared sets are only read.
 """
 
@@ -16,6 +17,8 @@ import tempfile
 import time
 from pathlib import Path
 from typing import NamedTuple
+
+from benchmarks.rendered import SCENES, made
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 SETS = ("kitchen", "office", "livingroom")
@@ -62,18 +65,29 @@ def scored(workspace: Path, *words: str) -> tuple[dict[str, float], float]:
     return figures, done.peak
 
 
-def row(name: str, what: str, figures: dict[str, float], seconds: float, peak: float) -> str:
+def row(name: str, what: str, figures: dict[str, float], seconds: float, peak: float, views: int) -> str:
     """A line of the table."""
     cells = [f"{figures[c]:.4g}" if figures.get(c) is not None else "" for c in COLUMNS]
-    return f"| {name} | {what} | " + " | ".join(cells) + f" | {seconds:.0f} | {peak:.2f} |"
+    return (
+        f"| {name} | {what} | "
+        + " | ".join(cells)
+        + f" | {seconds:.0f} | {seconds / views:.2f} | {peak:.2f} |"
+    )
+
+
+def source(name: str, work: Path) -> Path:
+    """The workspace of a set with its truth: a shared one, or a rendered one, which is made if need be."""
+    if name in SETS:
+        return SHARED / "data" / name
+    return made(name, work.parent / "rendered")
 
 
 def copied(name: str, work: Path) -> Path:
     """A workspace with the model and the pictures of a shared set, in which a result may be written."""
-    source, copy = SHARED / "data" / name, work / name
+    original, copy = source(name, work), work / name
     if not copy.exists():
-        shutil.copytree(source / "sparse", copy / "sparse")
-        os.symlink(source / "images", copy / "images")
+        shutil.copytree(original / "sparse", copy / "sparse")
+        os.symlink((original / "images").resolve(), copy / "images")
     return copy
 
 
@@ -95,13 +109,13 @@ def densified(name: str, steps: int, work: Path, rest: list[str]) -> tuple[dict[
     kept = work / f"{name}-{steps}"
     shutil.rmtree(kept, ignore_errors=True)
     shutil.copytree(copy / "dense-tco", kept)
-    return scored(SHARED / "data" / name, "--dense", str(kept))[0], done.seconds, done.peak
+    return scored(source(name, work), "--dense", str(kept))[0], done.seconds, done.peak
 
 
 def main() -> None:
     """Command line; other options are handed to densify."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sets", nargs="+", default=list(SETS))
+    parser.add_argument("--sets", nargs="+", default=list(SETS), choices=[*SETS, *SCENES])
     parser.add_argument("--steps", nargs="+", type=int, default=[0, 40])
     parser.add_argument("--baselines", nargs="*", default=["interp"], help="interp, patchmatch")
     parser.add_argument("--work", type=Path, default=Path("runs/quality"))
@@ -111,18 +125,19 @@ def main() -> None:
     out.write(
         "| set | method | "
         + " | ".join(COLUMNS)
-        + " | seconds | GiB |\n"
-        + "|---" * (len(COLUMNS) + 4)
+        + " | s | s / view | GiB |\n"
+        + "|---" * (len(COLUMNS) + 5)
         + "|\n"
     )
     for name in args.sets:
+        views = len(list((source(name, args.work) / "images").iterdir()))
         for baseline in args.baselines:
             half = ["--half"] if baseline == "patchmatch" else []
-            figures, peak = scored(SHARED / "data" / name, "--baseline", baseline, *half)
-            out.write(row(name, baseline, figures, figures["seconds"], peak) + "\n")
+            figures, peak = scored(source(name, args.work), "--baseline", baseline, *half)
+            out.write(row(name, baseline, figures, figures["seconds"], peak, views) + "\n")
         for steps in args.steps:
             figures, seconds, peak = densified(name, steps, args.work, rest)
-            out.write(row(name, f"colmap-tco, {steps} steps", figures, seconds, peak) + "\n")
+            out.write(row(name, f"colmap-tco, {steps} steps", figures, seconds, peak, views) + "\n")
             out.flush()
 
 

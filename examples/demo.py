@@ -37,8 +37,8 @@ def accuracy(sample: Sample, names: list[str], dense: Path) -> dict[str, float]:
 
     entries = {e.name: e for e in _pycolmap.registered(_pycolmap.read_model(dense / "sparse"))}
     used = [i for i, name in enumerate(names) if name in entries]
-    ours = _spread([entries[names[i]].cam_from_world for i in used])
-    unit = _spread([m[:3] for m in sample.cam_from_world[used]]) / ours
+    ours = spread([entries[names[i]].cam_from_world for i in used])
+    unit = spread([m[:3] for m in sample.cam_from_world[used]]) / ours
     errors, total = [], 0
     for i in used:
         depth = read_map(dense / "stereo" / "depth_maps" / f"{names[i]}.geometric.bin") * unit
@@ -54,7 +54,7 @@ def accuracy(sample: Sample, names: list[str], dense: Path) -> dict[str, float]:
     }
 
 
-def _spread(poses: list[NDArray[np.floating]]) -> float:
+def spread(poses: list[NDArray[np.floating]]) -> float:
     """Root mean square distance of camera centres from their mean."""
     centres = np.array([-m[:, :3].T @ m[:, 3] for m in poses])
     return float(np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()))

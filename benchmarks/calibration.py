@@ -1,0 +1,102 @@
+"""Is the predicted error of a pixel its actual error? Table and plot on the real sets.
+
+    python -m benchmarks.calibration [--steps 0] [--output docs/calibration.md]
+
+The embedded network predicts the scale b of a Laplace distribution of each pixel's relative depth error, for
+which the mean of |error| is b; confidence is 1 + 0.02 / b. Pixels are put into classes of b, and the mean and
+median of what a depth sensor says are set beside it. Errors above 50 % count as 50 %, as in training. The
+plot goes beside the Markdown file.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from benchmarks.real import arguments, load, publish
+from tco.backbones.sweep import ERROR_UNIT
+from tco.backbones.weights import EMBEDDED, load_sweep
+from tco.optimize import optimize
+from tco.options import TCOConfig
+
+EDGES = np.array([0.0, 0.003, 0.005, 0.0075, 0.01, 0.015, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, 1.0])
+Row = tuple[float, float, float, float, float]
+"""Share of the pixels; mean predicted error; mean and median actual error; share within 5 %."""
+
+
+def classes(predicted: NDArray[np.float64], actual: NDArray[np.float64]) -> list[Row]:
+    """One row for each class of predicted error that holds at least 200 pixels."""
+    rows, which = [], np.digitize(predicted, EDGES) - 1
+    for k in range(len(EDGES) - 1):
+        mine = which == k
+        if mine.sum() < 200:
+            continue
+        e = actual[mine]
+        rows.append(
+            (
+                float(mine.mean()), float(predicted[mine].mean()), float(e.mean()), float(np.median(e)),
+                float((e < 0.05).mean()),
+            )
+        )  # fmt: skip
+    return rows
+
+
+def gap(rows: list[Row]) -> float:
+    """Mean over the pixels of |log₂(actual / predicted)|: 1 is a factor of two."""
+    share = sum(row[0] for row in rows)
+    return sum(row[0] * abs(float(np.log2(row[2] / row[1]))) for row in rows) / share
+
+
+def plot(curves: dict[str, list[Row]], path: Path) -> None:
+    """Predicted against actual error of each set, both logarithmic."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.2, 4.8), layout="constrained")
+    axes = figure.subplots()
+    axes.plot([0.002, 0.5], [0.002, 0.5], color="0.6", linewidth=1, label="predicted = actual")
+    for name, rows in curves.items():
+        axes.plot([r[1] for r in rows], [r[2] for r in rows], marker="o", label=name)
+    axes.set(
+        xscale="log", yscale="log", xlabel="predicted relative error", ylabel="actual relative error, mean"
+    )
+    axes.legend()
+    axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    """Command line."""
+    parser = arguments(__doc__ or "")
+    parser.set_defaults(steps=0, size=256, views=0)
+    args = parser.parse_args()
+    network, curves = load_sweep(args.weights or EMBEDDED), {}
+    for name in args.sets:
+        real = load(name, args.size, args.views)
+        prediction = optimize(network, real.views, real.given, TCOConfig(steps=args.steps)).prediction
+        known = real.truth > 0
+        error = (prediction.depth / real.truth.clamp_min(1e-6) - 1).abs()[known].clamp_max(0.5)
+        predicted = (ERROR_UNIT / (prediction.confidence[known] - 1).clamp_min(1e-3)).to(torch.float64)
+        curves[name] = classes(predicted.numpy(), error.to(torch.float64).numpy())
+    text = (
+        f"# Calibration of the confidence\n\n`python -m benchmarks.calibration --steps {args.steps}`: "
+        f"{args.size} pixels, {args.views or 'all'} views.\n"
+    )
+    if args.output is not None:
+        plot(curves, args.output.with_suffix(".png"))
+        text += f"\n![predicted against actual error]({args.output.with_suffix('.png').name})\n"
+    for name, rows in curves.items():
+        text += (
+            f"\n## {name}\n\nOff by a factor of {2 ** gap(rows):.2f} on average.\n\n"
+            "| share of pixels | predicted | actual, mean | actual, median | within 5 % |\n"
+            "|---|---|---|---|---|\n"
+        )
+        for share, b, mean, median, close in rows:
+            text += f"| {share:.3f} | {b:.4f} | {mean:.4f} | {median:.4f} | {close:.3f} |\n"
+    publish(text, args.output)
+
+
+if __name__ == "__main__":
+    main()
