@@ -163,7 +163,7 @@ SCENES: dict[str, Callable[[], Sample]] = {
 
 def made(name: str, root: Path) -> Path:
     """The workspace of a scene; rendered and mapped if it is not there yet."""
-    folder = root / name
+    folder = (root / name).resolve()
     if (folder / "gt" / "gt.json").exists():
         return folder
     sample = SCENES[name]()

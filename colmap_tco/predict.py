@@ -131,8 +131,9 @@ def predict_chunk(
 def _paired(
     steps: list[dict[str, float]], own: list[dict[str, float]]
 ) -> list[tuple[dict[str, float], dict[str, float]]]:
-    """Each step with the penalties of the network's own cameras, where both were computed once a step."""
-    return list(zip(steps, own if len(own) == len(steps) else [{}] * len(steps), strict=True))
+    """Each step with the penalties of the network's own cameras; later steps, on the depths, have none."""
+    none: dict[str, float] = {}
+    return [(terms, own[i] if i < len(own) else none) for i, terms in enumerate(steps)]
 
 
 def _error_of_one_depth(depth: torch.Tensor) -> float:

@@ -19,6 +19,7 @@ from tco.free import FreePixels
 from tco.lora import LoRAConfig, adapted
 from tco.options import TCOConfig
 from tco.penalties import sparse_depth
+from tco.polish import polish
 from tco.schedule import Sources, Stagnation, draw_targets
 from tco.terms import COMPATIBILITY, Terms, means
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
@@ -36,9 +37,11 @@ class Outcome:
         prediction: of all views.
         cameras: of all views, with their corrections.
         corrections: how far each camera went (``CameraCorrections.sizes``); empty if none could move.
-        history: the named terms of every step, unweighted, and their weighted sum as ``loss``.
+        history: the named terms of every step, unweighted, and their weighted sum as ``loss``; first the
+            steps on the network, then those on the depths.
         rolled_back: steps at which the loss or its gradient was not finite; ``config.steps`` among them
             stands for the prediction after the last.
+        skipped: steps on the depths, counted from 0, of which the same is true.
     """
 
     prediction: Prediction
@@ -46,6 +49,7 @@ class Outcome:
     corrections: dict[str, list[float]] = field(default_factory=dict)
     history: list[dict[str, float]] = field(default_factory=list)
     rolled_back: tuple[int, ...] = ()
+    skipped: tuple[int, ...] = ()
 
 
 def optimize(
@@ -60,7 +64,8 @@ def optimize(
 
     Per step, one source view is decoded, becomes surfels, and is rendered into the views that overlap
     it most; the difference in colour, the disagreement in depth, the error at triangulated points and
-    the departure from the camera priors are lowered by Adam on low-rank adapters of the decoder.
+    the departure from the camera priors are lowered by Adam on low-rank adapters of the decoder. Then the
+    depths themselves are refined by the same objective (:mod:`tco.polish`).
 
     Without cameras among the priors, a network that predicts them is adapted to find them: by dense depths
     (``geometric_weight`` and ``depth_weight``), colours, or both.
@@ -105,7 +110,8 @@ def optimize(
             if run.stopped:
                 logger.info("stopped after %d steps: the error at hidden points falls no more", step + 1)
                 break
-        return run.outcome()
+        adapted_outcome = run.outcome()
+    return run.polished(adapted_outcome, report)
 
 
 class _Run:
@@ -310,6 +316,18 @@ class _Run:
         prediction = detached(prediction)
         sizes = {} if self.corrections is None else self.corrections.sizes()
         return Outcome(prediction, cameras, sizes, self.history, tuple(self.rolled_back))
+
+    def polished(self, outcome: Outcome, report: Report | None) -> Outcome:
+        """The outcome with its depths refined, if that is wanted; where cameras are sought it is not."""
+        if self.config.polish.polish_steps == 0 or self.priors.cameras is None:
+            return outcome
+        done = polish(outcome.prediction, outcome.cameras, self.terms, self.config, self.generator, report)
+        return replace(
+            outcome,
+            prediction=done.prediction,
+            history=[*outcome.history, *done.history],
+            skipped=tuple(done.skipped),
+        )
 
 
 FEWEST_POINTS = 4

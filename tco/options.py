@@ -47,6 +47,26 @@ class AblationConfig:
 
 
 @dataclass(frozen=True)
+class PolishConfig:
+    """Refinement of each pixel's depth after the network was adapted (``tco/polish.py``)."""
+
+    polish_steps: int = knob(
+        30, "steps on the depths themselves, after those on the network; 0, or no steps at all: none"
+    )
+    polish_rate: float = knob(
+        1e-3, "learning rate of the logarithms of the depths' factors (Adam); lower it if surfaces get rough"
+    )
+    polish_sources: int = knob(2, "views that each of these steps renders from")
+    polish_levels: tuple[int, ...] = knob(
+        (2, 8), "sides of the cells that share a factor, in pixels of the network's image; 1 follows noise"
+    )
+
+    def __post_init__(self) -> None:
+        if self.polish_steps < 0 or self.polish_sources < 1 or not self.polish_levels:
+            raise ValueError("polish_steps must not be negative, and there must be a source and a level")
+
+
+@dataclass(frozen=True)
 class TCOConfig:
     """Test-time constrained optimisation (Zhou et al., arXiv 2604.03878)."""
 
@@ -121,7 +141,13 @@ class TCOConfig:
     )
     structure: float = knob(0.5, "share of the structural term (SSIM) in the comparison of colours")
     clip: float = knob(1.0, "largest norm of the gradient")
+    polish: PolishConfig = field(default_factory=PolishConfig)
     ablation: AblationConfig = field(default_factory=AblationConfig)
+
+    @property
+    def all_steps(self) -> int:
+        """Steps on the network and those on the depths, which only follow where there are some."""
+        return self.steps + self.polish.polish_steps if self.steps else 0
 
     def __post_init__(self) -> None:
         if self.steps < 0 or self.targets < 1 or self.refresh < 1 or self.sources < 1:
@@ -137,4 +163,7 @@ class TCOConfig:
         A source drawn uniformly, all views decoded with gradients in every step, every other view a target.
         """
         ablation = replace(self.ablation, decode_all=True, source_order="uniform")
-        return replace(self, sources=1, targets=EVERY, refresh=1, lazy_refresh=False, ablation=ablation)
+        return replace(
+            self, sources=1, targets=EVERY, refresh=1, lazy_refresh=False, ablation=ablation,
+            polish=PolishConfig(polish_steps=0),
+        )  # fmt: skip

@@ -18,7 +18,7 @@ from tco.backbones.sweep import Sweep
 from tco.backbones.sweeping import Hints, interpolate_points
 from tco.backbones.weights import load_sweep
 from tco.optimize import Outcome, errors_at_points, optimize
-from tco.options import TCOConfig
+from tco.options import PolishConfig, TCOConfig
 from tco.penalties import sparse_depth
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
 
@@ -99,8 +99,9 @@ class Small(nn.Module):
         return self
 
 
-SMALL = TCOConfig(steps=6, lora_targets=("conv",), rate=0.01)
-QUICK = TCOConfig(steps=3)
+ALONE = PolishConfig(polish_steps=0)
+SMALL = TCOConfig(steps=6, lora_targets=("conv",), rate=0.01, polish=ALONE)
+QUICK = TCOConfig(steps=3, polish=ALONE)
 
 
 def depth_of(outcome: Outcome) -> Tensor:
@@ -174,7 +175,7 @@ def misfit(depth: Tensor, points: Sequence[SparseDepth]) -> float:
 def test_optimisation_lowers_the_loss(network: Sweep, scene: Scene) -> None:
     """The misfit to the points that it is given falls, and so does that of the whole loss by the epoch."""
     views, priors, _ = scene
-    config = TCOConfig(steps=4 * V, rate=3e-3, camera_rate=0, point_dropout=0)
+    config = TCOConfig(steps=4 * V, rate=3e-3, camera_rate=0, point_dropout=0, polish=ALONE)
     outcome = optimize(network, views, priors, config)
     plain = optimize(network, views, priors, TCOConfig(steps=0))
     assert priors.sparse is not None
@@ -422,7 +423,7 @@ def test_a_rate_that_makes_the_network_explode_gives_a_finite_result(scene: Scen
 def test_the_embedded_network_recovers_from_an_explosion(network: Sweep, scene: Scene) -> None:
     views, priors, _ = scene
     before = state(network)
-    config = TCOConfig(steps=4, rate=1e20, refresh=1)
+    config = TCOConfig(steps=4, rate=1e20, refresh=1, polish=ALONE)
     outcome = optimize(network, views, priors, config)
     assert outcome.rolled_back
     assert bool(torch.isfinite(depth_of(outcome)).all())

@@ -14,13 +14,14 @@ import tco.optimize
 from tco.backbones.base import Backbone
 from tco.geometry import invert, project, sample, so3_exp, transform, unproject
 from tco.optimize import Outcome, optimize
-from tco.options import AblationConfig, TCOConfig
+from tco.options import AblationConfig, PolishConfig, TCOConfig
 from tco.penalties import rotation_angle
 from tco.toy import Toy, Wall, wall
 from tco.types import Cameras
 
 TRUE = (-0.15, 0.0, 0.5)
-FIT = TCOConfig(steps=12, rate=0.01, lora_targets=("plane",), camera_rate=0)
+ALONE = PolishConfig(polish_steps=0)
+FIT = TCOConfig(steps=12, rate=0.01, lora_targets=("plane",), camera_rate=0, polish=ALONE)
 
 
 @pytest.fixture(scope="module")

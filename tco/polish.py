@@ -1,0 +1,153 @@
+"""After the network was adapted: the depths themselves, refined where the pictures say more than it does.
+
+Adapters change what the network makes of all views at once, and cannot put right what it makes of one place.
+Here the network's answer D is held fixed and multiplied by a field of factors, exp(δ), of which δ is a sum of
+bilinearly interpolated grids, zero at first. The objective is that of the adaptation: surfels of a source
+compared with the other views in colour, depths with depths, depths with points. No network is run, so that a
+step costs a fraction of one that adapts, and all views' depths are those of the moment.
+
+The paper optimises surfels directly as an ablation, without a network, and finds it worse (arXiv 2604.03878).
+Coarse grids make the difference: a grid of every pixel follows the noise of the pictures.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from tco.options import TCOConfig
+from tco.schedule import Sources, draw_targets
+from tco.terms import COMPATIBILITY, Terms, means
+from tco.types import Cameras, Prediction
+
+logger = logging.getLogger(__name__)
+
+LAST_RATE = 0.2
+"""The learning rate falls linearly to this share of the first."""
+
+
+class DepthField(nn.Module):
+    """Logarithms of factors of the depths of V views: sums of grids, each a level of coarser pixels."""
+
+    def __init__(self, depth: Tensor, levels: Sequence[int]) -> None:
+        """Take shape, dtype and device from the depth (V, H, W); a grid for each side of its cells in pixels.
+
+        Raises:
+            ValueError: no level, or one below a pixel.
+        """
+        super().__init__()
+        if not levels or min(levels) < 1:
+            raise ValueError(f"the sides of the cells must be at least a pixel, not {tuple(levels)}")
+        views, *size = depth.shape
+        self.size, self.levels = (size[0], size[1]), tuple(levels)
+        self.grids = nn.ParameterList(
+            torch.zeros(views, 1, *(-(-s // level) for s in size), dtype=depth.dtype, device=depth.device)
+            for level in levels
+        )
+
+    def forward(self, views: Sequence[int]) -> Tensor:
+        """δ (len(views), H, W)."""
+        h, w = self.size
+        total = None
+        for level, grid in zip(self.levels, self.grids, strict=True):
+            part = grid[list(views)]
+            if level > 1:
+                whole = (part.shape[-2] * level, part.shape[-1] * level)
+                part = F.interpolate(part, whole, mode="bilinear", align_corners=False)[..., :h, :w]
+            total = part if total is None else total + part
+        assert total is not None
+        return total.squeeze(1)
+
+
+@dataclass(frozen=True)
+class Polished:
+    """What polishing gives.
+
+    Attributes:
+        prediction: of all views.
+        history: the terms of every step, and their weighted sum as ``loss``.
+        skipped: steps, counted from 0, whose loss or gradient was not finite.
+    """
+
+    prediction: Prediction
+    history: list[dict[str, float]]
+    skipped: list[int]
+
+
+def polish(
+    prediction: Prediction,
+    cameras: Cameras,
+    terms: Terms,
+    config: TCOConfig,
+    generator: torch.Generator,
+    report: Callable[[int, dict[str, float]], None] | None = None,
+) -> Polished:
+    """Refine the depths of all V views; confidences stay.
+
+    Args:
+        prediction: of all views.
+        cameras: of all views, held fixed.
+        terms: of these views.
+        config: ``config.polish`` says how long and how fast; weights and targets are the adaptation's.
+        generator: draws sources and targets.
+        report: called after every step with its number, from ``config.steps`` on, and its terms.
+    """
+    c = config.polish
+    field = DepthField(prediction.depth, c.polish_levels)
+    optimiser = torch.optim.Adam(field.parameters(), c.polish_rate)
+    sources = Sources("epoch", terms.overlap, generator)
+    weights = {k: v for k, v in terms.weights(config.steps, False).items() if k != "depth"}
+    history: list[dict[str, float]] = []
+    skipped: list[int] = []
+    for step in range(c.polish_steps):
+        for group in optimiser.param_groups:
+            group["lr"] = c.polish_rate * (1 - (1 - LAST_RATE) * step / c.polish_steps)
+        optimiser.zero_grad(set_to_none=True)
+        with torch.no_grad():
+            now = _refined(prediction, field, range(len(prediction.depth)))
+        parts = []
+        for source in sources.draw(c.polish_sources):
+            targets = draw_targets(terms.overlap, source, config.targets, generator)
+            if not weights.keys() & COMPATIBILITY:
+                targets = []
+            mine = _refined(prediction, field, [source])
+            part = terms.of_source(source, targets, mine, now, cameras, weights)
+            if part:
+                # One source after the other, so that only one rendering is in memory.
+                loss = torch.stack([weights[name] * value for name, value in part.items()]).sum()
+                (loss / c.polish_sources).backward()
+                parts.append({name: value.detach() for name, value in part.items()} | {"loss": loss.detach()})
+        figures = {name: float(value) for name, value in means(parts).items()} or {"loss": 0.0}
+        if _finite(field, figures["loss"]):
+            optimiser.step()
+        else:
+            logger.warning("step %d on the depths: the loss or its gradient is not finite; skipped", step)
+            skipped.append(step)
+        history.append(figures)
+        if report is not None:
+            report(config.steps + step, figures)
+    with torch.no_grad():
+        return Polished(_refined(prediction, field, range(len(prediction.depth))), history, skipped)
+
+
+def _refined(prediction: Prediction, field: DepthField, views: Sequence[int]) -> Prediction:
+    """The prediction of some views with its depths times their factors."""
+    chosen = list(views)
+    return replace(
+        prediction,
+        depth=prediction.depth[chosen] * torch.exp(field(chosen)),
+        confidence=prediction.confidence[chosen],
+        views=tuple(chosen),
+        stages=(),
+    )
+
+
+def _finite(field: DepthField, loss: float) -> bool:
+    grads = [p.grad for p in field.parameters() if p.grad is not None]
+    return math.isfinite(loss) and all(bool(torch.isfinite(g).all()) for g in grads)

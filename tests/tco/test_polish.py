@@ -1,0 +1,150 @@
+"""Depths refined by the pictures: what the field can say, what is found, what is left as it was."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from tco.optimize import optimize
+from tco.options import PolishConfig, TCOConfig
+from tco.polish import DepthField, polish
+from tco.terms import Terms
+from tco.toy import Toy, Wall, wall
+from tco.types import Prediction
+
+CONFIG = TCOConfig(
+    camera_rate=0, polish=PolishConfig(polish_steps=24, polish_rate=4e-3, polish_levels=(4, 16))
+)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Wall:
+    return wall()
+
+
+def bump(scene: Wall, height: float) -> Tensor:
+    """Factors (V, H, W) of depth: 1 + height in the middle of each view, falling off smoothly."""
+    _, h, w = scene.depth.shape
+    y = torch.linspace(-1, 1, h).unsqueeze(1)
+    x = torch.linspace(-1, 1, w)
+    return (1 + height * torch.exp(-4 * (x**2 + y**2))).expand_as(scene.depth)
+
+
+def predicted(scene: Wall, factor: Tensor) -> Prediction:
+    """The true depth times factors, with a confidence of 10."""
+    assert scene.priors.cameras is not None
+    depth = scene.depth * factor
+    return Prediction(depth, torch.full_like(depth, 10.0), scene.priors.cameras, tuple(range(len(depth))))
+
+
+def refined(scene: Wall, prediction: Prediction, config: TCOConfig = CONFIG, seed: int = 0) -> Prediction:
+    terms = Terms(scene.views, scene.priors, config)
+    draw = torch.Generator().manual_seed(seed)
+    return polish(prediction, prediction.cameras, terms, config, draw).prediction
+
+
+def off(prediction: Prediction, scene: Wall) -> float:
+    return float((prediction.depth / scene.depth - 1).abs().mean())
+
+
+def test_the_field_is_nothing_at_first_and_a_sum_of_its_levels() -> None:
+    depth = torch.ones(3, 21, 30)
+    field = DepthField(depth, (1, 4, 16))
+    assert [tuple(g.shape) for g in field.grids] == [(3, 1, 21, 30), (3, 1, 6, 8), (3, 1, 2, 2)]
+    assert torch.equal(field([0, 2]), torch.zeros(2, 21, 30))
+    with torch.no_grad():
+        for grid, value in zip(field.grids, (1.0, 10.0, 100.0), strict=True):
+            grid[1] = value
+    torch.testing.assert_close(field([1, 0]), torch.stack([torch.full((21, 30), 111.0), torch.zeros(21, 30)]))
+
+
+def test_a_level_is_linear_between_the_middles_of_its_cells() -> None:
+    """A ramp over the cells is that ramp over the pixels: their centres are at +0.5, those of cells at +2."""
+    field = DepthField(torch.ones(1, 16, 24), (4,))
+    with torch.no_grad():
+        field.grids[0][0, 0] = 4 * torch.arange(6.0) + 2
+    x = torch.arange(24.0) + 0.5
+    torch.testing.assert_close(field([0])[0, :, 2:-2], x[2:-2].expand(16, 20))
+
+
+def test_cells_must_have_a_size() -> None:
+    for levels in ((), (0, 2)):
+        with pytest.raises(ValueError, match="at least a pixel"):
+            DepthField(torch.ones(1, 4, 4), levels)
+    with pytest.raises(ValueError, match="a source and a level"):
+        PolishConfig(polish_levels=())
+
+
+def test_a_bump_is_taken_away(scene: Wall) -> None:
+    """By the colours; the agreement of depths that are wrong alike holds some of it back."""
+    wrong = predicted(scene, bump(scene, 0.04))
+    colours = replace(CONFIG, sparse_weight=0.0, consistency_weight=0.0)
+    by_colours, by_all = (off(refined(scene, wrong, c), scene) / off(wrong, scene) for c in (colours, CONFIG))
+    assert by_colours < 0.6 and by_all < 0.75
+
+
+def test_the_truth_is_left_alone(scene: Wall) -> None:
+    """Adam's steps have a size of their own: what remains is of the order of one, which is the rate."""
+    right = predicted(scene, torch.ones_like(scene.depth))
+    assert off(refined(scene, right), scene) < CONFIG.polish.polish_rate
+
+
+def test_other_parts_of_the_prediction_stay(scene: Wall) -> None:
+    wrong = predicted(scene, bump(scene, 0.04))
+    before = wrong.depth.clone()
+    done = refined(scene, wrong)
+    assert torch.equal(wrong.depth, before) and torch.equal(done.confidence, wrong.confidence)
+    assert done.views == wrong.views and done.cameras is wrong.cameras
+    assert not done.depth.requires_grad
+
+
+def test_the_same_seed_gives_the_same_depths(scene: Wall) -> None:
+    wrong = predicted(scene, bump(scene, 0.04))
+    short = replace(CONFIG, polish=replace(CONFIG.polish, polish_steps=4))
+    first, again, other = (refined(scene, wrong, short, seed).depth for seed in (3, 3, 4))
+    assert torch.equal(first, again) and not torch.equal(first, other)
+
+
+def test_views_that_share_nothing_are_drawn_to_their_points(scene: Wall) -> None:
+    alone = replace(scene, priors=replace(scene.priors, overlap=torch.zeros(4, 4)))
+    far = predicted(scene, torch.full_like(scene.depth, 1.03))
+    terms = Terms(alone.views, alone.priors, CONFIG)
+    done = polish(far, far.cameras, terms, CONFIG, torch.Generator().manual_seed(0))
+    assert all(step.keys() == {"sparse", "loss"} for step in done.history)
+    assert off(done.prediction, scene) < 0.6 * off(far, scene)
+
+
+def test_what_is_not_finite_is_skipped(scene: Wall, caplog: pytest.LogCaptureFixture) -> None:
+    """Points of infinite depth: no step is taken, and the depths are as they were."""
+    assert scene.priors.sparse is not None
+    broken = tuple(replace(s, depth=s.depth * math.inf) for s in scene.priors.sparse)
+    bad = replace(scene, priors=replace(scene.priors, sparse=broken))
+    config = replace(CONFIG, polish=replace(CONFIG.polish, polish_steps=3))
+    start = predicted(scene, bump(scene, 0.04))
+    with caplog.at_level(logging.WARNING):
+        done = polish(
+            start,
+            start.cameras,
+            Terms(bad.views, bad.priors, config),
+            config,
+            torch.Generator().manual_seed(0),
+        )
+    assert done.skipped == [0, 1, 2] and "not finite; skipped" in caplog.text
+    torch.testing.assert_close(done.prediction.depth, start.depth)
+
+
+def test_it_follows_the_steps_on_the_network(scene: Wall) -> None:
+    config = replace(CONFIG, steps=2, lora_targets=("plane",), polish=PolishConfig(polish_steps=3))
+    seen: list[int] = []
+    outcome = optimize(Toy(), scene.views, scene.priors, config, report=lambda step, _: seen.append(step))
+    assert seen == list(range(config.all_steps)) and len(outcome.history) == config.all_steps == 5
+    plain = optimize(Toy(), scene.views, scene.priors, replace(config, polish=PolishConfig(polish_steps=0)))
+    assert len(plain.history) == 2 and not torch.equal(plain.prediction.depth, outcome.prediction.depth)
+    none = optimize(Toy(), scene.views, scene.priors, replace(config, steps=0))
+    assert none.history == [] and replace(config, steps=0).all_steps == 0
+    assert config.reference_schedule().all_steps == 2
