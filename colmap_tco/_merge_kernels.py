@@ -22,7 +22,7 @@ def average(
     normals: NDArray[np.float32],
 ) -> None:
     """Fill ``points`` and ``normals`` (M, 3) of the reference frame with the weighted means of the votes."""
-    _, _, _, weights, shifts, theirs, _ = votes
+    _, _, _, weights, shifts, theirs, _, _ = votes
     width = ref.shape[1]
     for m in range(len(pixels)):
         row = pixels[m] // width
