@@ -40,8 +40,8 @@ class FillConfig:
 
     fill_only: str = knob(
         "",
-        "dense workspace of COLMAP, with sparse/ and geometric depth and normal maps in stereo/, made from the "
-        "same model: its depths are kept and only the pixels without one are filled. Empty: none.",
+        "dense workspace of COLMAP, with sparse/ and geometric depth and normal maps in stereo/, made from "
+        "the same model: its depths are kept and only the pixels without one are filled. Empty: none.",
     )
     kept_confidence: float = knob(
         30.0,

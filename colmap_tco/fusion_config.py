@@ -63,7 +63,8 @@ class FusionConfig:
     max_depth_ratio: float = knob(
         3.0,
         "Sky and far background: pixels deeper than this many times the depth that 98 % of the model's "
-        "points in the view do not exceed are dropped. Raise it where a background without points matters. 0: off.",
+        "points in the view do not exceed are dropped. Raise it where a background without points matters. "
+        "0: off.",
     )
     min_tri_angle: float = knob(
         1.0,

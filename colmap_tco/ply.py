@@ -34,7 +34,7 @@ _POINT = np.dtype(
 _DOUBLE_POINT = np.dtype(
     [(name, "<f8") for name in ("x", "y", "z")] + [(name, _POINT[name]) for name in (_POINT.names or ())[3:]]
 )
-_STRIPES = 0.05
+_STRIPES = 0.01
 """Rounding above this share of the spacing of the points shows as stripes."""
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -109,7 +109,7 @@ def join(clouds: Iterable[Cloud]) -> Cloud:
 
 
 def needs_double(points: NDArray[np.floating]) -> bool:
-    """Whether float32 would round (N, 3) coordinates by more than a twentieth of the points' spacing.
+    """Whether float32 would round (N, 3) coordinates by more than a hundredth of the points' spacing.
 
     The spacing is that of as many points spread over a square of the size of the cloud, without its
     outermost tenth.

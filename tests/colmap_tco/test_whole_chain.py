@@ -14,8 +14,10 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from colmap_tco import _pycolmap
 from colmap_tco.chunks import Chunk
@@ -23,7 +25,7 @@ from colmap_tco.fusion import FusionConfig, fuse
 from colmap_tco.outputs import fusion_views, undistorted_model, write_cloud, write_model, write_view
 from colmap_tco.ply import read_ply
 from colmap_tco.predict import predict_chunk
-from colmap_tco.priors import PriorConfig
+from colmap_tco.priors import PriorConfig, chunk_frame
 from colmap_tco.tracks import read_tracks
 from colmap_tco.views import View, ViewConfig, make_views
 from colmap_tco.workspace import DensePaths, open_workspace
@@ -37,7 +39,7 @@ NORMAL = np.array([0.5, 0.35, -1.0]) / np.linalg.norm([0.5, 0.35, -1.0])
 DISTANCE, DARK, BRIGHT = 4.0, 0.0, 0.6
 """Distance of the cameras, and the inverse depths that are drawn black and white."""
 NAMES = [f"{i}.png" for i in range(5)]
-PIXEL = DISTANCE / 430 * 480 / 160
+PIXEL = DISTANCE / 129.3
 """Size of a pixel of the depth maps at the distance of the plane."""
 
 
@@ -59,7 +61,7 @@ class Reader:
     ) -> Prediction:
         pictures, priors = encoded
         chosen = tuple(range(len(pictures))) if views is None else tuple(views)
-        grey = pictures.images[list(chosen)].mean(1)
+        grey = pictures.images[list(chosen)].mean(1).clamp(min=0.01)
         depth = 1 / (DARK + (BRIGHT - DARK) * grey) / self.unit
         depth = torch.roll(depth, (self.shift, self.shift), (1, 2))
         return Prediction(depth, torch.full_like(depth, 2.0), priors.cameras, chosen)
@@ -104,8 +106,6 @@ def chain(root: Path, origin: Floats, shift: int = 0) -> tuple[Floats, list[View
     assert not skipped
     tracks = read_tracks(workspace.model)
     everything = Chunk(tuple(range(len(views))))
-    from colmap_tco.priors import chunk_frame
-
     reader = Reader(chunk_frame(tracks, views).scale, shift)
     settings = (PriorConfig(holdout=0.0), TCOConfig(steps=0), 0)
     done = predict_chunk((reader, torch.device("cpu")), tracks, views, everything, settings, lambda _: None)
@@ -122,8 +122,46 @@ def chain(root: Path, origin: Floats, shift: int = 0) -> tuple[Floats, list[View
     return read_ply(paths.ply)[0], views
 
 
-def test_a_plane_keeps_its_place_to_a_fiftieth_of_a_pixel(tmp_path: Path) -> None:
-    points, views = chain(tmp_path, np.zeros(3))
-    off = points @ NORMAL / PIXEL
-    print(len(points), off.mean(), np.median(off), off.std(), views[0].network, views[0].camera)
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> tuple[Floats, list[View], Path]:
+    root = tmp_path_factory.mktemp("plain")
+    return *chain(root, np.zeros(3)), root
+
+
+def test_a_plane_keeps_its_place_to_a_fiftieth_of_a_pixel(plain: tuple[Floats, list[View], Path]) -> None:
+    points, views, _ = plain
+    assert (views[0].network.width, views[0].network.height) == (160, 120)
+    assert views[0].camera.width > 1.05 * SHOT.size[0], "undistortion shall change the size"
     assert len(points) > 10_000
+    off = points @ NORMAL / PIXEL
+    assert abs(off.mean()) < 0.02
+    assert abs(np.median(off)) < 0.02
+    # No tilt either: what is left does not depend on the place.
+    slope = np.linalg.lstsq(np.c_[points[:, :2], np.ones(len(points))], off, rcond=None)[0]
+    assert np.abs(slope).max() < 0.02
+
+
+def test_that_would_show_a_fault_of_half_a_pixel(tmp_path: Path) -> None:
+    """Depths moved by one pixel of the map are found as such: (n_x + n_y) pixels off the plane."""
+    points, _ = chain(tmp_path, np.zeros(3), shift=1)
+    turned = pose(2, np.zeros(3))[:, :3] @ NORMAL
+    off = np.median(points @ NORMAL) / PIXEL
+    assert off == pytest.approx(turned[0] + turned[1], rel=0.25)
+    assert abs(off) / 2 > 0.3
+
+
+def test_map_coordinates_give_the_same_cloud_without_stripes(
+    plain: tuple[Floats, list[View], Path], tmp_path: Path
+) -> None:
+    """A model at easting 500 km, northing 5400 km: the same points, to a thousandth of a pixel."""
+    origin = np.array([500_000.0, 5_400_000.0, 300.0])
+    near, far = plain[0], chain(tmp_path, origin)[0] - origin
+    assert abs(len(far) - len(near)) < 0.002 * len(near)
+    distance = cKDTree(near).query(far)[0] / PIXEL
+    assert np.quantile(distance, 0.99) < 1e-3
+    header = (tmp_path / "dense" / "fused.ply").read_bytes()[:400]
+    assert b"property double x" in header and b"property float nx" in header
+    assert b"property float x" in (plain[2] / "dense" / "fused.ply").read_bytes()[:400]
+    # Float32 would leave a grid of half a unit, some twelve pixels wide.
+    assert len(np.unique(far[:, 1])) > 0.9 * len(far)
+    assert len(np.unique((far[:, 1] + origin[1]).astype(np.float32))) < 20
