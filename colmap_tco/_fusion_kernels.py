@@ -86,11 +86,15 @@ def _turn_back(pair: NDArray[np.float64], x: float, y: float, z: float) -> tuple
 
 
 @njit(cache=True, error_model="numpy")
-def _bend(before: float, centre: float, after: float) -> float:
-    """Second difference of inverse depth relative to the centre; 0 where a depth is missing."""
-    if before <= 0.0 or centre <= 0.0 or after <= 0.0:
-        return 0.0
-    return abs(centre / before - 2.0 + centre / after)
+def _bends(before: float, centre: float, after: float, most: float) -> bool:
+    """Whether the second difference of inverse depth is above ``most`` of the centre's, not divided by it.
+
+    False where a depth is missing.
+    """
+    if before <= 0.0 or after <= 0.0:
+        return False
+    product = before * after
+    return abs(centre * (before + after) - 2.0 * product) > most * product
 
 
 @njit(cache=True, error_model="numpy")
@@ -116,12 +120,10 @@ def _classify_one(
     x, y = ray(camera, row, col)
     if -(nx * x + ny * y + nz) < min_cos * np.sqrt(x * x + y * y + 1.0):
         return GRAZING
-    bend = 0.0
-    if 0 < col < view.shape[1] - 1:
-        bend = _bend(view[row, col - 1, 0], z, view[row, col + 1, 0])
-    if 0 < row < view.shape[0] - 1:
-        bend = max(bend, _bend(view[row - 1, col, 0], z, view[row + 1, col, 0]))
-    return EDGE if bend > max_bend else KEEP
+    bent = 0 < col < view.shape[1] - 1 and _bends(view[row, col - 1, 0], z, view[row, col + 1, 0], max_bend)
+    if not bent and 0 < row < view.shape[0] - 1:
+        bent = _bends(view[row - 1, col, 0], z, view[row + 1, col, 0], max_bend)
+    return EDGE if bent else KEEP
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

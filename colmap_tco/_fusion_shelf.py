@@ -112,11 +112,10 @@ class Shelf:
         maps = view.load()
         _check_maps(view, maps, self._config)
         shape = maps.depth.shape
-        packed = np.ones((*shape, kernels.CHANNELS), np.float32)
+        packed = np.empty((*shape, kernels.CHANNELS), np.float32)
         packed[..., 0] = maps.depth
         packed[..., 1:4] = maps.normal
-        if maps.confidence is not None:
-            packed[..., 4] = maps.confidence
+        packed[..., 4] = 1.0 if maps.confidence is None else maps.confidence
         camera = kernels.camera(map_intrinsics(view.camera, shape))
         marks = np.zeros(shape, np.uint8)
         if maps.mask is not None:

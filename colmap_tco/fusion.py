@@ -287,14 +287,17 @@ class _Reference:
         return colors
 
     def _visibility(self, votes: Votes) -> Visibility:
-        columns = [votes.agrees(slot) for slot in range(len(self.neighbours))]
-        seen = np.stack([np.ones(len(votes.seen), bool), *columns], 1)
-        images = np.array([self.views[p].index for p in (self.position, *self.neighbours)], np.uint32)
-        order = np.argsort(images, kind="stable")
-        point, column = np.nonzero(seen[:, order])
-        start = np.zeros(len(seen) + 1, np.int64)
-        np.cumsum(np.bincount(point, minlength=len(seen)), out=start[1:])
-        return Visibility(start, images[order][column])
+        from colmap_tco import _merge_kernels
+
+        own = self.views[self.position].index
+        theirs = np.array([self.views[p].index for p in self.neighbours], np.uint32)
+        slots = np.argsort(theirs, kind="stable")
+        before = int((theirs < own).sum())
+        start = np.zeros(len(votes.support) + 1, np.int64)
+        np.cumsum(votes.support, out=start[1:])
+        images = np.empty(start[-1], np.uint32)
+        _merge_kernels.list_views(votes.who, slots, theirs, (before, own), start, images)
+        return Visibility(start, images)
 
     def _own(self) -> ShelfView:
         return self.shelf.get(self.position)

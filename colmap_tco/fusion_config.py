@@ -67,7 +67,7 @@ class FusionConfig:
         "0: off.",
     )
     min_tri_angle: float = knob(
-        1.0,
+        0.25,
         "Far background: points that the reference and all views that agree with it see within an angle, in "
         "degrees, smaller than this are dropped: their depth is little more than a guess. 0: off.",
     )
