@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-KEEP, NO_DEPTH, MASKED, LOW_CONFIDENCE, NO_NORMAL, GRAZING, EDGE = range(7)
+KEEP, NO_DEPTH, MASKED, LOW_CONFIDENCE, NO_NORMAL, GRAZING, EDGE, FAR = range(8)
 """Why a pixel takes no part, as :func:`classify` marks it."""
 
 _MOST_TILT = 1.05
@@ -34,6 +34,7 @@ Votes = tuple[
     NDArray[np.float32],
     NDArray[np.float32],
     NDArray[np.uint64],
+    NDArray[np.float32],
 ]
 """The arrays of :class:`colmap_tco.fusion_votes.Votes`. Kernels take tuples, not classes of ours: numba's
 cache on disk would name the class, and fail to load once a later version has renamed it."""
@@ -85,11 +86,15 @@ def _turn_back(pair: NDArray[np.float64], x: float, y: float, z: float) -> tuple
 
 
 @njit(cache=True, error_model="numpy")
-def _bend(before: float, centre: float, after: float) -> float:
-    """Second difference of inverse depth relative to the centre; 0 where a depth is missing."""
-    if before <= 0.0 or centre <= 0.0 or after <= 0.0:
-        return 0.0
-    return abs(centre / before - 2.0 + centre / after)
+def _bends(before: float, centre: float, after: float, most: float) -> bool:
+    """Whether the second difference of inverse depth is above ``most`` of the centre's, not divided by it.
+
+    False where a depth is missing.
+    """
+    if before <= 0.0 or after <= 0.0:
+        return False
+    product = before * after
+    return abs(centre * (before + after) - 2.0 * product) > most * product
 
 
 @njit(cache=True, error_model="numpy")
@@ -98,13 +103,15 @@ def _classify_one(
     camera: NDArray[np.float64],
     row: int,
     col: int,
-    bounds: tuple[float, float, float],
+    bounds: tuple[float, float, float, float],
 ) -> int:
     """The mark of one pixel; ``bounds`` as in :func:`classify`."""
-    min_confidence, max_bend, min_cos = bounds
+    min_confidence, max_bend, min_cos, max_depth = bounds
     z = view[row, col, 0]
     if not z > 0.0:
         return NO_DEPTH
+    if z > max_depth:
+        return FAR
     if view[row, col, 4] < min_confidence:
         return LOW_CONFIDENCE
     nx, ny, nz = view[row, col, 1], view[row, col, 2], view[row, col, 3]
@@ -113,26 +120,24 @@ def _classify_one(
     x, y = ray(camera, row, col)
     if -(nx * x + ny * y + nz) < min_cos * np.sqrt(x * x + y * y + 1.0):
         return GRAZING
-    bend = 0.0
-    if 0 < col < view.shape[1] - 1:
-        bend = _bend(view[row, col - 1, 0], z, view[row, col + 1, 0])
-    if 0 < row < view.shape[0] - 1:
-        bend = max(bend, _bend(view[row - 1, col, 0], z, view[row + 1, col, 0]))
-    return EDGE if bend > max_bend else KEEP
+    bent = 0 < col < view.shape[1] - 1 and _bends(view[row, col - 1, 0], z, view[row, col + 1, 0], max_bend)
+    if not bent and 0 < row < view.shape[0] - 1:
+        bent = _bends(view[row - 1, col, 0], z, view[row + 1, col, 0], max_bend)
+    return EDGE if bent else KEEP
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def classify(
     view: NDArray[np.float32],
     camera: NDArray[np.float64],
-    bounds: tuple[float, float, float],
+    bounds: tuple[float, float, float, float],
     rows: tuple[int, int],
     marks: NDArray[np.uint8],
 ) -> None:
     """Mark each pixel in ``rows`` of ``marks`` (H, W) that is not MASKED with KEEP or why it is dropped.
 
     ``bounds``: least confidence, largest relative second difference of the inverse depth, least
-    cosine between the normal and the direction to the camera.
+    cosine between the normal and the direction to the camera, largest depth.
     """
     for row in range(rows[0], rows[1]):
         for col in range(view.shape[1]):
@@ -179,6 +184,17 @@ def _reprojection(
     du = pair[0] * (moved[0] * inverse - direction[0])
     dv = pair[1] * (moved[1] * inverse - direction[1])
     return float(du * du + dv * dv)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _between(
+    pair: NDArray[np.float64], row: int, col: int, z: float, centre: tuple[float, float, float]
+) -> float:
+    """Cosine of the angle at a pixel's point between its camera and one with this centre."""
+    x, y = ray(pair, row, col)
+    a, b, c = x * z - centre[0], y * z - centre[1], z - centre[2]
+    product = x * a + y * b + c
+    return float(product / np.sqrt((x * x + y * y + 1.0) * (a * a + b * b + c * c)))
 
 
 UNSEEN, HOLE, OCCLUDED, THROUGH, DEPTH, REPROJECTION, NORMAL, AGREES = range(8)
@@ -242,7 +258,8 @@ def vote(
     An agreeing view counts with its confidence. Weights that fall with the depth error would draw the
     mean to the reference, whose own error is as large. ``outcomes`` (8,) counts each outcome.
     """
-    seen, support, conflicts, weights, shifts, normals, who = votes
+    seen, support, conflicts, weights, shifts, normals, who, cosines = votes
+    there = _turn_back(pair, -pair[15], -pair[19], -pair[23])
     width = ref.shape[1]
     word, bit = slot >> 6, np.uint64(1) << np.uint64(slot & 63)
     for m in range(len(pixels)):
@@ -267,6 +284,7 @@ def vote(
         if outcome == AGREES:
             support[m] += 1
             who[m, word] |= bit
+            cosines[m] = min(cosines[m], _between(pair, row, col, float(ref[row, col, 0]), there))
             weights[m] += weight
             shifts[m, 0] += weight * dx
             shifts[m, 1] += weight * dy

@@ -22,6 +22,7 @@ _MARKS = {
     "no_normal": kernels.NO_NORMAL,
     "max_view_angle": kernels.GRAZING,
     "max_depth_bend": kernels.EDGE,
+    "max_depth_ratio": kernels.FAR,
 }
 
 
@@ -111,16 +112,15 @@ class Shelf:
         maps = view.load()
         _check_maps(view, maps, self._config)
         shape = maps.depth.shape
-        packed = np.ones((*shape, kernels.CHANNELS), np.float32)
+        packed = np.empty((*shape, kernels.CHANNELS), np.float32)
         packed[..., 0] = maps.depth
         packed[..., 1:4] = maps.normal
-        if maps.confidence is not None:
-            packed[..., 4] = maps.confidence
+        packed[..., 4] = 1.0 if maps.confidence is None else maps.confidence
         camera = kernels.camera(map_intrinsics(view.camera, shape))
         marks = np.zeros(shape, np.uint8)
         if maps.mask is not None:
             marks[~maps.mask] = kernels.MASKED
-        bounds = _bounds(self._config)
+        bounds = _bounds(self._config, view)
         self.workers.run(
             shape[0],
             _ROWS,
@@ -130,7 +130,7 @@ class Shelf:
         taken = np.zeros(shape, np.uint8)
         if position in self._taken:
             taken = np.unpackbits(self._taken.pop(position), count=marks.size).reshape(shape)
-        numbers = np.bincount(marks.ravel(), minlength=kernels.EDGE + 1)
+        numbers = np.bincount(marks.ravel(), minlength=kernels.FAR + 1)
         return ShelfView(
             packed,
             camera,
@@ -141,9 +141,10 @@ class Shelf:
         )
 
 
-def _bounds(config: FusionConfig) -> tuple[float, float, float]:
+def _bounds(config: FusionConfig, view: FusionView) -> tuple[float, float, float, float]:
     bend = config.max_depth_bend if config.max_depth_bend > 0 else math.inf
-    return config.min_confidence, bend, math.cos(math.radians(config.max_view_angle))
+    far = config.max_depth_ratio * view.reach if config.max_depth_ratio > 0 else math.inf
+    return config.min_confidence, bend, math.cos(math.radians(config.max_view_angle)), far
 
 
 def _check_maps(view: FusionView, maps: FusionMaps, config: FusionConfig) -> None:

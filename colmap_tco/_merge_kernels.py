@@ -22,7 +22,7 @@ def average(
     normals: NDArray[np.float32],
 ) -> None:
     """Fill ``points`` and ``normals`` (M, 3) of the reference frame with the weighted means of the votes."""
-    _, _, _, weights, shifts, theirs, _ = votes
+    _, _, _, weights, shifts, theirs, _, _ = votes
     width = ref.shape[1]
     for m in range(len(pixels)):
         row = pixels[m] // width
@@ -140,3 +140,34 @@ def mark_taken(
             for i in range(max(int(np.ceil(u - reach - 0.5)), 0), min(int(u + reach - 0.5), width - 1) + 1):
                 if abs(other[j, i, 0] - z) <= depth_error * z:
                     taken[j, i] = 1
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def list_views(
+    who: NDArray[np.uint64],
+    slots: NDArray[np.int64],
+    indices: NDArray[np.uint32],
+    own: tuple[int, int],
+    start: NDArray[np.int64],
+    images: NDArray[np.uint32],
+) -> None:
+    """Fill ``images`` with the views that agree on each point (M,) and the reference, in ascending order.
+
+    Args:
+        who: (M, words) one bit for each neighbour that agrees.
+        slots: the neighbours in ascending order of their index.
+        indices: of the neighbours, by slot.
+        own: how many of ``slots`` come before the reference, and its index.
+        start: (M + 1,) where the list of each point begins.
+        images: all lists.
+    """
+    before, index = own
+    for m in range(len(who)):
+        at = start[m]
+        for k in range(len(slots) + 1):
+            if k == before:
+                images[at] = index
+                at += 1
+            if k < len(slots) and (who[m, slots[k] >> 6] >> np.uint64(slots[k] & 63)) & np.uint64(1):
+                images[at] = indices[slots[k]]
+                at += 1

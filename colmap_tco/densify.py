@@ -22,6 +22,7 @@ from colmap_tco.attempts import within_memory
 from colmap_tco.backbones import Budget, NetworkConfig, Selected, load, select, suited
 from colmap_tco.chunks import Chunk, ChunkPlan, plan_chunks, source_views
 from colmap_tco.errors import InputError, OutOfMemoryError, PartlyDoneError
+from colmap_tco.fill import Existing, FillConfig, fill, open_existing
 from colmap_tco.fusion import EmptyCloudError, FusionConfig, fuse
 from colmap_tco.lock import locked
 from colmap_tco.mapping import MappingConfig, ensure_model
@@ -53,6 +54,7 @@ class DensifyConfig:
     views: ViewConfig = field(default_factory=ViewConfig)
     priors: PriorConfig = field(default_factory=PriorConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
+    fill: FillConfig = field(default_factory=FillConfig)
     workspace: WorkspaceConfig = field(default_factory=WorkspaceConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
 
@@ -137,19 +139,21 @@ def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified
         pairs = covisibility(tracks, [view.image_id for view in views])
         budget = Budget.of(chosen, views, config.network, config.tco.steps)
         plan = plan_chunks(pairs.common, budget.views())
-        key, maps = _fingerprints(workspace, views, config, chosen)
+        existing = _existing(config, views)
+        key, maps = _fingerprints(workspace, views, config, chosen, existing)
         result = open_result(root, key, config.overwrite, maps)
     if result.finished:
         return Densified(result.paths.root, json.loads(result.paths.report.read_text("utf-8")), fresh=False)
     alone = {views[i].name: why for i, why in plan.skipped.items()}
     skipped = {**workspace.skipped, **skipped, **blind, **alone}
     with clock("optimisation"), _threads(config.num_threads):
-        failed = _predict(result, tracks, views, pairs, plan, config, (chosen, budget), progress)
+        run = (chosen, budget, existing)
+        failed = _predict(result, tracks, views, pairs, plan, config, run, progress)
     used = _used(result, views, config.refine_cameras)
     if not used:
         _nothing_used(skipped, failed)
     with clock("fusion"):
-        figures = _fuse_and_write(result, workspace, used, pairs, views, config, progress)
+        figures = _fuse_and_write(result, workspace, used, (pairs, tracks), views, config, progress)
     figures |= {
         "views": report.view_table(
             result, used, {"skipped": skipped, "failed": failed, "unregistered": workspace.unregistered}
@@ -217,7 +221,11 @@ def _open_or_map(root: Path, config: DensifyConfig) -> Workspace:
 
 
 def _fingerprints(
-    workspace: Workspace, views: Sequence[View], config: DensifyConfig, chosen: Selected
+    workspace: Workspace,
+    views: Sequence[View],
+    config: DensifyConfig,
+    chosen: Selected,
+    existing: Existing | None,
 ) -> tuple[str, str]:
     """Two texts: one changes with everything that decides the result, one with what decides the maps."""
     kept = dataclasses.replace(
@@ -232,7 +240,7 @@ def _fingerprints(
         contents.append(chosen.weights)
     else:
         told["weights"] = f"{chosen.weights.name} {status.st_size} {status.st_mtime_ns}"
-    pictures = [view.path for view in views]
+    pictures = [view.path for view in views] + (existing.files() if existing else [])
 
     def key(settings: DensifyConfig) -> str:
         return fingerprint({"settings": outputs.plain(settings), **told}, contents, pictures)
@@ -242,14 +250,14 @@ def _fingerprints(
 
 def _predict(
     result: Result, tracks: Tracks, views: Sequence[View], pairs: Covisibility, plan: ChunkPlan,
-    config: DensifyConfig, run: tuple[Selected, Budget], progress: Progress,
+    config: DensifyConfig, run: tuple[Selected, Budget, Existing | None], progress: Progress,
 ) -> dict[str, str]:  # fmt: skip
     """Optimise the chunks that are not finished yet and write the maps of their views.
 
     Returns:
         Name → why a view could not be predicted.
     """
-    chosen, budget = run
+    chosen, budget, existing = run
     todo = [c for c in plan.chunks if not all(result.is_done(views[i].name) for i in c.owned)]
     progress.stage("optimisation", sum(config.tco.all_steps + len(c.owned) for c in todo))
     if not todo:
@@ -268,7 +276,7 @@ def _predict(
         if attempt.result is None:
             failed.update({view.name: attempt.why for view in owned})
             continue
-        _write_chunk(result, owned, attempt.result, progress)
+        _write_chunk(result, owned, attempt.result, existing, progress)
         result.mark_chunk(
             {
                 "views": [views[i].name for i in attempt.chunk.views],
@@ -281,18 +289,34 @@ def _predict(
     return failed
 
 
-def _write_chunk(result: Result, owned: Sequence[View], done: ChunkResult, progress: Progress) -> None:
+def _existing(config: DensifyConfig, views: Sequence[View]) -> Existing | None:
+    """The PatchMatch result to complete, if any."""
+    if config.fill.fill_only and config.refine_cameras:
+        raise InputError(
+            "--fill_only keeps depths of COLMAP's cameras, --refine_cameras moves these: give one of the two"
+        )
+    return open_existing(config.fill, views)
+
+
+def _write_chunk(
+    result: Result,
+    owned: Sequence[View],
+    done: ChunkResult,
+    existing: Existing | None,
+    progress: Progress,
+) -> None:
     """Write the maps of a chunk's own views, and record them as done."""
     for view in owned:
         r = done.views[view.name]
-        outputs.write_view(result.paths, view, r.maps)
+        maps, filled = fill(existing, view, r.maps) if existing else (r.maps, {})
+        outputs.write_view(result.paths, view, maps)
         camera = r.corrected.camera
         # Rounded like the figures of the report, a camera in map coordinates would be metres off.
         exact = {
             "cam_from_world": r.corrected.cam_from_world.tolist(),
             "focal": [camera.fx, camera.fy],
         }
-        figures: Any = outputs.plain(r.figures)
+        figures: Any = outputs.plain({**r.figures, **filled})
         result.mark_done(view.name, {**figures, **exact})
         progress.advance(1)
 
@@ -324,10 +348,11 @@ def _used(result: Result, views: Sequence[View], refine: bool) -> list[View]:
 
 
 def _fuse_and_write(
-    result: Result, workspace: Workspace, used: Sequence[View], pairs: Covisibility, views: Sequence[View],
-    config: DensifyConfig, progress: Progress,
+    result: Result, workspace: Workspace, used: Sequence[View], seen: tuple[Covisibility, Tracks],
+    views: Sequence[View], config: DensifyConfig, progress: Progress,
 ) -> dict[str, Any]:  # fmt: skip
     """Model, lists and cloud; returns their figures for the report."""
+    pairs, tracks = seen
     progress.stage("fusion", 1)
     names = [view.name for view in views]
     sources = source_views(pairs, config.fusion.check_num_images)
@@ -338,7 +363,10 @@ def _fuse_and_write(
     outputs.write_lists(result.paths, {view.name: neighbours[view.name] for view in used})
     why = None
     try:
-        cloud, fused = fuse(outputs.fusion_views(result.paths, used, neighbours, indices), config.fusion)
+        reach = outputs.reaches(tracks, used)
+        cloud, fused = fuse(
+            outputs.fusion_views(result.paths, used, neighbours, indices, reach), config.fusion
+        )
     except EmptyCloudError as error:  # the depth maps are there all the same
         cloud, fused, why = error.cloud, error.report, str(error)
     outputs.write_cloud(result.paths, cloud)

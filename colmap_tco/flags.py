@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import difflib
 import math
+import re
 import types
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
@@ -165,11 +166,22 @@ def build(config_type: type[T], namespace: argparse.Namespace) -> T:
 def normalise(argv: Iterable[str]) -> list[str]:
     """The words of a command line with every ``--long-option=value`` spelt ``--long_option=value``.
 
-    Only the names of options change, and nothing after a bare ``--``.
+    Only the names of options change, and nothing after a bare ``--``. Numbers with commas that begin with
+    a minus are joined to the option before them, for argparse would take them for an option.
     """
     words = list(argv)
     end = words.index("--") if "--" in words else len(words)
-    return [_underscored(word) for word in words[:end]] + words[end:]
+    joined: list[str] = []
+    for word in words[:end]:
+        if _NUMBERS.fullmatch(word) and joined and joined[-1].startswith("--") and "=" not in joined[-1]:
+            joined[-1] += f"={word}"
+        else:
+            joined.append(_underscored(word))
+    return joined + words[end:]
+
+
+_NUMBERS = re.compile(r"-[\d.][\d.eE+-]*(,[\d.eE+-]*)+")
+"""A list of numbers of which the first is negative."""
 
 
 def closest(flag: str, known: Iterable[str]) -> str | None:

@@ -23,16 +23,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_tco.errors import DensifyError
+from colmap_tco.fusion_config import FusionConfig
+from colmap_tco.fusion_input import FusionMaps, FusionView
 from colmap_tco.fusion_report import FusionReport, Tolerance, why_empty
 from colmap_tco.fusion_votes import Votes
 from colmap_tco.ply import Cloud, Visibility, join
+from colmap_tco.thin import thin
 from colmap_tco.workers import Workers
-from tco.config import knob
 
 if TYPE_CHECKING:
     from colmap_tco._fusion_kernels import Limits
     from colmap_tco._fusion_shelf import Shelf, ShelfView
-    from colmap_tco.pinhole import Pinhole
+
+__all__ = ["EmptyCloudError", "FusionConfig", "FusionMaps", "FusionView", "fuse", "fuse_views"]
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -45,101 +48,6 @@ _COLOR_SAMPLES = 15
 """Views that a colour is the median of, at most."""
 _FEWEST_VIEWS = 3
 """Where fewer views than ``min_num_pixels`` can see a point, all of them but at least these must agree."""
-
-
-@dataclass(frozen=True)
-class FusionConfig:
-    """Which depths agree and which pixels take part; COLMAP's names and defaults where these exist."""
-
-    min_num_pixels: int = knob(
-        5,
-        "Views that must agree on a point, the reference included. A pixel that fewer views could see "
-        "needs all of those, at least 3 (2 where a view has one neighbour). Lower it for few images.",
-    )
-    max_reproj_error: float = knob(
-        2.0,
-        "Largest distance, in pixels of the full image, between a pixel and its way to a neighbour and back.",
-    )
-    max_depth_error: float = knob(
-        0.01, "Largest relative difference between depths that agree: |z − d| / z. Raise it for noisy depths."
-    )
-    max_normal_error: float = knob(10.0, "Largest angle, in degrees, between normals that agree.")
-    check_num_images: int = knob(50, "Neighbours that a view is compared with, the best overlapping first.")
-    cache_size: float = knob(
-        4.0,
-        "Gigabytes of maps and images kept in memory (COLMAP: 32). More saves reading when views are many.",
-    )
-    num_threads: int = knob(-1, "Threads of all stages; -1 is one a core.")
-    min_confidence: float = knob(
-        1.0, "Pixels of a lower confidence are dropped. Confidence is at least 1, so that 1 keeps all."
-    )
-    max_depth_bend: float = knob(
-        0.05,
-        "Pixels beside a discontinuity, where flying points arise, are dropped: those whose inverse depth q "
-        "has a relative second difference |q₋ − 2 q + q₊| / q above this; planes have none. 0: off.",
-    )
-    max_view_angle: float = knob(
-        85.0, "Surfaces seen at a larger angle to their normal, in degrees, are dropped. 90 switches it off."
-    )
-    max_conflicts: float = knob(
-        1.0,
-        "A point is dropped if the views that look through it, to a surface behind, are more than this many "
-        "times the views that agree on it. 0 switches it off.",
-    )
-    adapt_to_noise: bool = knob(
-        True,
-        "Widen max_depth_error, max_reproj_error and max_normal_error to 1.5 times the median difference "
-        "between the views, for depths less exact than those of PatchMatch. Off: the values as given.",
-    )
-    sigma_at_one: float = knob(
-        0.0,
-        "Relative depth error s of a pixel of confidence 1; that of confidence c is s / c. If given, the "
-        "allowed error is max(max_depth_error, √(s²/c₁² + s²/c₂²)), for depths whose confidence is "
-        "calibrated. 0: not used.",
-    )
-    most_depth_error: float = knob(
-        0.05, "Bound of the allowed relative error where adapt_to_noise or sigma_at_one raises it."
-    )
-
-
-@dataclass(frozen=True)
-class FusionMaps:
-    """The arrays of one view.
-
-    Attributes:
-        depth: (H, W) camera z, 0 where there is none; may be smaller than the image.
-        normal: (H, W, 3) unit normals in the camera frame, facing the camera, 0 where there is none.
-        image: (H', W', 3) uint8 RGB, undistorted, of any size with the camera's field of view.
-        confidence: (H, W) at least 1, or None if there is none.
-        mask: (H, W) bool, False where pixels shall take no part, or None.
-    """
-
-    depth: NDArray[np.float32]
-    normal: NDArray[np.float32]
-    image: NDArray[np.uint8]
-    confidence: NDArray[np.float32] | None = None
-    mask: NDArray[np.bool_] | None = None
-
-
-@dataclass(frozen=True)
-class FusionView:
-    """One view of the dense workspace.
-
-    Attributes:
-        name: image name, for messages and the report.
-        index: position of the image in ``Reconstruction.reg_image_ids()``, for the visibility.
-        camera: pinhole of the undistorted image.
-        cam_from_world: (3, 4) or (4, 4) float64.
-        neighbours: positions in the list of views that is fused, the best overlapping first.
-        load: reads the arrays; called again if they had to leave the cache.
-    """
-
-    name: str
-    index: int
-    camera: Pinhole
-    cam_from_world: NDArray[np.float64]
-    neighbours: tuple[int, ...]
-    load: Callable[[], FusionMaps]
 
 
 class EmptyCloudError(DensifyError):
@@ -164,6 +72,10 @@ def fuse(views: Sequence[FusionView], config: FusionConfig | None = None) -> tup
     config = config or FusionConfig()
     report = FusionReport()
     cloud = join(fuse_views(views, config, report))
+    kept = thin(cloud.points, config.voxel_size, config.max_points)
+    if len(kept) < len(cloud):
+        report.thin(kept)
+        cloud = cloud.select(kept)
     if not len(cloud):
         raise EmptyCloudError(cloud, report)
     if report.lowered:
@@ -204,6 +116,13 @@ def _check(views: Sequence[FusionView], config: FusionConfig) -> None:
     for name in ("min_num_pixels", "check_num_images", "max_reproj_error", "max_depth_error", "cache_size"):
         if not getattr(config, name) > 0:
             raise ValueError(f"{name} must be positive, not {getattr(config, name)}")
+    for name in ("voxel_size", "max_points", "max_depth_ratio", "min_tri_angle"):
+        if not getattr(config, name) >= 0:
+            raise ValueError(f"{name} must not be negative, it is {getattr(config, name)}")
+    if config.roi and not (len(config.roi) == 6 and np.all(np.less(config.roi[:3], config.roi[3:]))):
+        raise ValueError(
+            f"roi must be xmin,ymin,zmin,xmax,ymax,zmax with each minimum below its maximum, not {config.roi}"
+        )
     for position, view in enumerate(views):
         wrong = [n for n in view.neighbours if not 0 <= n < len(views) or n == position]
         if wrong or len(set(view.neighbours)) != len(view.neighbours):
@@ -255,12 +174,20 @@ class _Reference:
         colors = self._colors_and_marks(points, votes)
         view = self.views[self.position]
         rotation, centre = view.cam_from_world[:3, :3], _centre(view)
-        return Cloud(
+        cloud = Cloud(
             points.astype(np.float64) @ rotation + centre,
             (normals @ rotation).astype(np.float32),
             colors,
             self._visibility(votes),
         )
+        return self._crop(cloud) if self.config.roi else cloud
+
+    def _crop(self, cloud: Cloud) -> Cloud:
+        """The points in the region of interest, at the very end, so that the region changes none of them."""
+        low, high = np.array(self.config.roi[:3]), np.array(self.config.roi[3:])
+        inside = np.flatnonzero(((cloud.points >= low) & (cloud.points <= high)).all(1))
+        self.report.pixels["roi"] += len(cloud) - len(inside)
+        return cloud.select(inside)
 
     def _vote(self, pixels: NDArray[np.int64]) -> Votes:
         from colmap_tco import _fusion_kernels as kernels
@@ -303,6 +230,11 @@ class _Reference:
         keep = supported & ~through
         self.report.pixels["max_conflicts"] += int(through.sum())
         self.report.pixels["min_num_pixels"] += int((~supported & ~through).sum())
+        if self.config.min_tri_angle > 0:
+            least = math.cos(math.radians(self.config.min_tri_angle))
+            narrow = keep & (votes.support > 1) & (votes.cosine > least)
+            self.report.pixels["min_tri_angle"] += int(narrow.sum())
+            keep &= ~narrow
         self.report.lowered += int((keep & (votes.support < wanted)).sum())
         return keep
 
@@ -355,14 +287,17 @@ class _Reference:
         return colors
 
     def _visibility(self, votes: Votes) -> Visibility:
-        columns = [votes.agrees(slot) for slot in range(len(self.neighbours))]
-        seen = np.stack([np.ones(len(votes.seen), bool), *columns], 1)
-        images = np.array([self.views[p].index for p in (self.position, *self.neighbours)], np.uint32)
-        order = np.argsort(images, kind="stable")
-        point, column = np.nonzero(seen[:, order])
-        start = np.zeros(len(seen) + 1, np.int64)
-        np.cumsum(np.bincount(point, minlength=len(seen)), out=start[1:])
-        return Visibility(start, images[order][column])
+        from colmap_tco import _merge_kernels
+
+        own = self.views[self.position].index
+        theirs = np.array([self.views[p].index for p in self.neighbours], np.uint32)
+        slots = np.argsort(theirs, kind="stable")
+        before = int((theirs < own).sum())
+        start = np.zeros(len(votes.support) + 1, np.int64)
+        np.cumsum(votes.support, out=start[1:])
+        images = np.empty(start[-1], np.uint32)
+        _merge_kernels.list_views(votes.who, slots, theirs, (before, own), start, images)
+        return Visibility(start, images)
 
     def _own(self) -> ShelfView:
         return self.shelf.get(self.position)

@@ -19,6 +19,7 @@ class Votes(NamedTuple):
         shift: (M, 3) weighted sum of the ways from the point to their surfaces, in the reference frame.
         normal: (M, 3) weighted sum of their normals, in the reference frame.
         who: (M, words) one bit for each neighbour that agrees.
+        cosine: (M,) of the largest angle between the rays of the reference and of a view that agrees.
     """
 
     seen: NDArray[np.uint16]
@@ -28,6 +29,7 @@ class Votes(NamedTuple):
     shift: NDArray[np.float32]
     normal: NDArray[np.float32]
     who: NDArray[np.uint64]
+    cosine: NDArray[np.float32]
 
     @classmethod
     def none(cls, pixels: int, neighbours: int) -> Votes:
@@ -41,6 +43,7 @@ class Votes(NamedTuple):
             shift=np.zeros((pixels, 3), np.float32),
             normal=np.zeros((pixels, 3), np.float32),
             who=np.zeros((pixels, words), np.uint64),
+            cosine=np.ones(pixels, np.float32),
         )
 
     def select(self, keep: NDArray[np.bool_] | slice) -> Votes:
@@ -53,6 +56,7 @@ class Votes(NamedTuple):
             self.shift[keep],
             self.normal[keep],
             self.who[keep],
+            self.cosine[keep],
         )
 
     def agrees(self, neighbour: int) -> NDArray[np.bool_]:

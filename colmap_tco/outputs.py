@@ -20,14 +20,17 @@ from colmap_tco import _pycolmap
 from colmap_tco._pycolmap import Model
 from colmap_tco.atomic import UNFINISHED, atomic_file, write_text
 from colmap_tco.errors import DensifyError
-from colmap_tco.fusion import FusionMaps, FusionView
+from colmap_tco.fusion_input import FusionMaps, FusionView
 from colmap_tco.maps import read_map, write_map
-from colmap_tco.ply import Cloud, write_ply, write_vis
+from colmap_tco.ply import Cloud, needs_double, write_ply, write_vis
+from colmap_tco.tracks import Tracks
 from colmap_tco.views import View, undistorted_image
 from colmap_tco.workspace import DensePaths, read_image
 
 JPEG_QUALITY = 95
 _DIGITS = 6
+_FEWEST_POINTS, _NEARLY_ALL = 10, 0.98
+"""Points of a view below which their depths bound nothing, and the share that shall lie before the bound."""
 
 
 @dataclass(frozen=True)
@@ -150,8 +153,8 @@ def write_lists(paths: DensePaths, neighbours: Mapping[str, Sequence[str]]) -> N
 
 
 def write_cloud(paths: DensePaths, cloud: Cloud) -> None:
-    """Write ``fused.ply`` and ``fused.ply.vis``."""
-    write_ply(paths.ply, cloud.points, cloud.normals, cloud.colors)
+    """Write ``fused.ply``, in double precision where its coordinates need it, and ``fused.ply.vis``."""
+    write_ply(paths.ply, cloud.points, cloud.normals, cloud.colors, needs_double(cloud.points))
     write_vis(paths.vis, cloud.visibility)
 
 
@@ -160,6 +163,7 @@ def fusion_views(
     views: Sequence[View],
     neighbours: Mapping[str, Sequence[str]],
     indices: Mapping[str, int],
+    reach: Mapping[str, float] | None = None,
 ) -> list[FusionView]:
     """The views of a dense workspace for :func:`colmap_tco.fusion.fuse`; arrays are read when needed.
 
@@ -168,6 +172,7 @@ def fusion_views(
         views: the views to fuse.
         neighbours: name → names of overlapping views, the best first; others than ``views`` are ignored.
         indices: as :func:`write_model` returns them.
+        reach: name → depth that hardly a point exceeds, see :func:`reaches`; no bound for other views.
     """
     position = {view.name: i for i, view in enumerate(views)}
     return [
@@ -178,9 +183,21 @@ def fusion_views(
             cam_from_world=view.cam_from_world,
             neighbours=tuple(position[n] for n in neighbours[view.name] if n in position),
             load=lambda name=view.name: read_view(paths, name),  # type: ignore[misc]
+            reach=(reach or {}).get(view.name, math.inf),
         )
         for view in views
     ]
+
+
+def reaches(tracks: Tracks, views: Sequence[View]) -> dict[str, float]:
+    """Name → depth that 2 % of the points in a view exceed; of the views with enough points to say."""
+    found = {}
+    for view in views:
+        xyz = tracks.xyz[tracks.images[view.image_id].point]
+        depth = xyz @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3]
+        if len(depth) >= _FEWEST_POINTS:
+            found[view.name] = float(np.quantile(depth, _NEARLY_ALL))
+    return found
 
 
 def read_view(paths: DensePaths, name: str) -> FusionMaps:

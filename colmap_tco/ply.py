@@ -1,8 +1,12 @@
 """Point clouds and their visibility: ``fused.ply`` and ``fused.ply.vis`` exactly as COLMAP writes them.
 
 ``fused.ply`` is binary little-endian with float32 x y z nx ny nz and uint8 red green blue, 27 bytes
-a point. ``fused.ply.vis`` is a uint64 number of points, then for each point a uint32 count and that
-many uint32 image indices, positions in ``Reconstruction.reg_image_ids()``.
+a point. Where float32 would round the coordinates visibly (:func:`needs_double`: models in projected
+map coordinates, which it would cut into stripes), x y z are ``double`` instead, 39 bytes a point. There
+is no offset to add: the coordinates are always those of the model.
+
+``fused.ply.vis`` is a uint64 number of points, then for each point a uint32 count and that many uint32
+image indices, positions in ``Reconstruction.reg_image_ids()``.
 """
 
 from __future__ import annotations
@@ -27,6 +31,11 @@ _POINT = np.dtype(
     [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
     + [(name, "u1") for name in ("red", "green", "blue")]
 )
+_DOUBLE_POINT = np.dtype(
+    [(name, "<f8") for name in ("x", "y", "z")] + [(name, _POINT[name]) for name in (_POINT.names or ())[3:]]
+)
+_STRIPES = 0.01
+"""Rounding above this share of the spacing of the points shows as stripes."""
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
@@ -52,6 +61,13 @@ class Visibility:
     def __getitem__(self, point: int) -> NDArray[np.uint32]:
         return self.images[self.start[point] : self.start[point + 1]]
 
+    def select(self, points: NDArray[np.int64]) -> Visibility:
+        """The lists of some points (M,), in that order."""
+        first, count = self.start[points], np.diff(self.start)[points]
+        start = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
+        within = np.arange(start[-1]) - np.repeat(start[:-1], count)
+        return Visibility(start, self.images[np.repeat(first, count) + within])
+
 
 @dataclass(frozen=True)
 class Cloud:
@@ -72,6 +88,12 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.points)
 
+    def select(self, points: NDArray[np.int64]) -> Cloud:
+        """The cloud of some points (M,), in that order."""
+        return Cloud(
+            self.points[points], self.normals[points], self.colors[points], self.visibility.select(points)
+        )
+
 
 def join(clouds: Iterable[Cloud]) -> Cloud:
     """One cloud of the points of all, in order."""
@@ -86,6 +108,20 @@ def join(clouds: Iterable[Cloud]) -> Cloud:
     )
 
 
+def needs_double(points: NDArray[np.floating]) -> bool:
+    """Whether float32 would round (N, 3) coordinates by more than a hundredth of the points' spacing.
+
+    The spacing is that of as many points spread over a square of the size of the cloud, without its
+    outermost tenth.
+    """
+    if len(points) < 2:
+        return False
+    low, high = np.quantile(points, (0.05, 0.95), axis=0)
+    spacing = float(np.linalg.norm(high - low)) / np.sqrt(len(points))
+    rounding = float(np.spacing(np.float32(np.abs([low, high]).max()))) / 2
+    return rounding > _STRIPES * spacing > 0
+
+
 Block = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.uint8]]
 """Points (N, 3), normals (N, 3) and uint8 colours (N, 3)."""
 
@@ -95,42 +131,40 @@ def write_ply(
     points: NDArray[np.floating],
     normals: NDArray[np.floating],
     colors: NDArray[np.uint8],
+    double: bool = False,
 ) -> None:
-    """Write (N, 3) points, normals and uint8 colours atomically.
+    """Write (N, 3) points, normals and uint8 colours atomically; ``double`` as :func:`write_ply_blocks`.
 
     Raises:
         ValueError: see :func:`write_ply_blocks`.
     """
-    write_ply_blocks(path, [(points, normals, colors)])
+    write_ply_blocks(path, [(points, normals, colors)], double)
 
 
-def write_ply_blocks(path: str | os.PathLike[str], blocks: Iterable[Block]) -> int:
+def write_ply_blocks(path: str | os.PathLike[str], blocks: Iterable[Block], double: bool = False) -> int:
     """Write a cloud that arrives in blocks, atomically; returns the number of points.
 
-    The header holds the count, so the points wait in a temporary file until the last block.
+    The header holds the count, so the points wait in a temporary file until the last block. Coordinates
+    are written as float64 if ``double``, else as float32, COLMAP's way.
 
     Raises:
         ValueError: shapes that do not agree, a colour that is not uint8, or a value that is not finite.
     """
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    total = 0
+    total, layout = 0, _DOUBLE_POINT if double else _POINT
     with tempfile.TemporaryFile(dir=Path(path).parent) as body:
         for points, normals, colors in blocks:
-            body.write(_records(path, points, normals, colors).tobytes())
+            body.write(_records(path, (points, normals, colors), layout).tobytes())
             total += len(points)
         body.seek(0)
         with atomic_file(path) as file:
-            file.write(_header(total))
+            file.write(_header(total, layout))
             shutil.copyfileobj(body, file, 1 << 20)
     return total
 
 
-def _records(
-    path: str | os.PathLike[str],
-    points: NDArray[np.floating],
-    normals: NDArray[np.floating],
-    colors: NDArray[np.uint8],
-) -> NDArray[np.void]:
+def _records(path: str | os.PathLike[str], block: Block, layout: np.dtype[np.void]) -> NDArray[np.void]:
+    points, normals, colors = block
     shape = (len(points), 3)
     if not points.shape == normals.shape == colors.shape == shape:
         raise ValueError(
@@ -140,7 +174,7 @@ def _records(
         raise ValueError(f"{path}: colours are {colors.dtype}, not uint8")
     if not (np.isfinite(points).all() and np.isfinite(normals).all()):
         raise ValueError(f"{path}: a point or normal is not finite")
-    records = np.empty(len(points), _POINT)
+    records = np.empty(len(points), layout)
     for axis, name in enumerate("xyz"):
         records[name] = points[:, axis]
         records[f"n{name}"] = normals[:, axis]
@@ -149,10 +183,10 @@ def _records(
     return records
 
 
-def _header(count: int) -> bytes:
-    kinds = {"<f4": "float", "|u1": "uchar"}
+def _header(count: int, layout: np.dtype[np.void]) -> bytes:
+    kinds = {"<f4": "float", "<f8": "double", "|u1": "uchar"}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    lines += [f"property {kinds[_POINT[name].str]} {name}" for name in _POINT.names or ()]
+    lines += [f"property {kinds[layout[name].str]} {name}" for name in layout.names or ()]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
 

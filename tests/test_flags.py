@@ -215,3 +215,9 @@ def test_a_setting_may_not_be_the_negation_of_a_switch() -> None:
 )
 def test_the_closest_flag(mistyped: str, meant: str | None) -> None:
     assert flags.closest(mistyped, ["--steps", "--max_image_size", "--seed"]) == meant
+
+
+def test_lists_that_begin_with_a_negative_number_are_values() -> None:
+    for words in (["--roi-box", "-1,2,-3.5e2"], ["--roi-box=-1,2,-3.5e2"]):
+        assert flags.normalise(words) == ["--roi_box=-1,2,-3.5e2"]
+    assert flags.normalise(["--a", "-1", "-x,y", "--b=1", "-2,3"]) == ["--a", "-1", "-x,y", "--b=1", "-2,3"]

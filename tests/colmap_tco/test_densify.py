@@ -630,3 +630,51 @@ def test_exit_code_6_when_an_image_is_missing(
     for _ in range(2):
         assert command("densify", str(fresh_room.root), *FLAGS, "--steps", "0") == 6
         assert "1 images were left out" in capsys.readouterr().err
+
+
+def test_an_existing_result_is_kept_and_completed_within_a_region(fresh_room: Room) -> None:
+    """COLMAP's undistorted cameras with true depths in the upper half; the cloud cut and thinned."""
+    from colmap_tco import _pycolmap
+    from colmap_tco.fill import FillConfig
+    from colmap_tco.fusion import FusionConfig
+    from colmap_tco.maps import write_map
+    from colmap_tco.normals import normals_from_depth
+    from colmap_tco.pinhole import Pinhole
+    from colmap_tco.workspace import DensePaths
+
+    root, dense = fresh_room.root, DensePaths(fresh_room.root / "dense")
+    dense.root.mkdir()
+    _pycolmap.load().undistort_images(str(dense.root), str(root / "sparse" / "0"), str(root / "images"))
+    K, (h, w) = fresh_room.sample.K[0], fresh_room.sample.depth.shape[1:]
+    camera = Pinhole(w, h, *(float(K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))))
+    for name, depth in zip(fresh_room.names, fresh_room.sample.depth, strict=True):
+        upper = np.where(np.arange(h)[:, None] < h // 2, depth, 0).astype(np.float32)
+        write_map(dense.depth_map(name), upper)
+        write_map(dense.normal_map(name), normals_from_depth(upper, camera))
+    box = (-100.0, -100.0, -100.0, *np.median(surface(fresh_room), 0).tolist())
+    settings = config(
+        fill=FillConfig(fill_only=str(dense.root)), fusion=FusionConfig(roi=box, max_points=500)
+    )
+    with pytest.raises(InputError, match="refine_cameras"):
+        made(root, replace(settings, refine_cameras=True))
+    result = made(root, settings)
+    points = read_ply(result.folder / "fused.ply")[0]
+    assert 400 < len(points) <= 500
+    assert (points <= np.array(box[3:]) + 1e-6).all()
+    pixels = result.report["fusion"]["pixels"]
+    assert pixels["roi"] > 0 < pixels["thinned"]
+    assert pixels["points"] == len(points) == len(read_vis(result.folder / "fused.ply.vis"))
+    for i, name in enumerate(fresh_room.names):
+        depth = read_map(result.folder / "stereo" / "depth_maps" / f"{name}.geometric.bin")
+        assert depth.shape == (h, w)
+        error = np.abs(depth / truth(fresh_room, i, depth.shape) - 1)
+        assert (error[: h // 2] < 1e-3).mean() > 0.99
+        assert 0.5 < (error[h // 2 :] < 0.05).mean() > (error[h // 2 :] < 1e-3).mean()
+        figures = result.report["views"][name]
+        assert figures["pixels_kept"] == pytest.approx(h * w / 2, rel=0.01)
+        assert figures["pixels_kept"] + figures["pixels_filled"] == (depth > 0).sum()
+
+
+def surface(room: Room) -> np.ndarray:
+    """Points (N, 3) of the model of a room."""
+    return read_tracks(open_workspace(room.root).model).xyz

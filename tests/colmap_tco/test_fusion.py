@@ -280,10 +280,16 @@ def test_the_order_of_a_neighbour_list_does_not_matter() -> None:
     assert fused_bytes(views) == fused_bytes(turned)
 
 
-def test_threads_and_repetition_give_identical_bytes() -> None:
-    views = noisy_views(3)
-    once = fused_bytes(views, replace(CONFIG, num_threads=2))
-    assert once == fused_bytes(views, replace(CONFIG, num_threads=2)) == fused_bytes(views)
+def test_threads_and_repetition_give_identical_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In pieces of 500 pixels and 7 rows, so that the threads really share a view of this size."""
+    views = noisy_views(4)
+    whole = fused_bytes(views)
+    monkeypatch.setattr("colmap_tco.fusion._RANGE", 500)
+    monkeypatch.setattr("colmap_tco._fusion_shelf._ROWS", 7)
+    for threads in (1, 2, 5, 5):
+        assert fused_bytes(views, replace(CONFIG, num_threads=threads)) == whole
+    monkeypatch.setattr("colmap_tco.fusion._BLOCK", 1000)
+    assert fused_bytes(views, replace(CONFIG, num_threads=5)) == whole
 
 
 def test_a_small_cache_gives_the_same_cloud_in_bounded_memory() -> None:
@@ -346,10 +352,13 @@ def removed(name: str, maps: FusionMaps) -> FusionMaps:
 
 
 @pytest.mark.parametrize(
-    "name", [name for name in FILTERS if name not in ("max_conflicts", "min_num_pixels")]
+    "name",
+    [n for n in FILTERS if n not in ("max_conflicts", "min_num_pixels", "min_tri_angle", "roi")],
 )
 def test_an_empty_result_names_the_filter(name: str) -> None:
     views = [with_maps(view, lambda maps: removed(name, maps)) for view in Scene().views()]
+    if name == "max_depth_ratio":
+        views = [replace(view, reach=0.1 * DISTANCE) for view in views]
     with pytest.raises(DensifyError, match=FILTERS[name].split("(")[0]) as error:
         fuse(views, replace(CONFIG, min_confidence=2.0 if name == "min_confidence" else 1.0))
     assert str(7 * SIZE[0] * SIZE[1]) in str(error.value)

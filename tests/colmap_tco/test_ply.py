@@ -13,6 +13,7 @@ from colmap_tco.ply import (
     Cloud,
     Visibility,
     join,
+    needs_double,
     read_ply,
     read_vis,
     write_ply,
@@ -62,6 +63,32 @@ def test_round_trip(tmp_path, count):
     assert np.array_equal(n, normals)
     assert np.array_equal(c, colors)
     assert len(list((tmp_path / "new").iterdir())) == 1
+
+
+def test_double_coordinates_keep_every_bit(tmp_path):
+    points, normals, colors = random_cloud(50)
+    points = points.astype(np.float64) + (5e5, 5.4e6, 300)
+    write_ply(tmp_path / "a.ply", points, normals, colors, double=True)
+    back = read_ply(tmp_path / "a.ply")
+    for written, read in zip((points, normals.astype(np.float32), colors), back, strict=True):
+        assert np.array_equal(written, read)
+    header, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    assert b"property double z\nproperty float nx" in header
+    assert len(body) == 50 * 39
+    o3d = pytest.importorskip("open3d", reason="open3d cannot be imported here")
+    assert np.array_equal(np.asarray(o3d.io.read_point_cloud(str(tmp_path / "a.ply")).points), points)
+
+
+@pytest.mark.parametrize(
+    ("origin", "extent", "count", "double"),
+    [(0, 1, 10**4, False), (0, 10**6, 10**4, False), (100, 30, 10**4, False), (5e6, 100, 10**4, True),
+     (5e5, 100, 10**4, True), (5e6, 5e5, 100, False), (5e6, 0, 100, False), (5e6, 100, 1, False),
+     (5e6, 100, 0, False)],
+)  # fmt: skip
+def test_doubles_are_taken_where_float32_would_round_the_spacing(origin, extent, count, double):
+    """A sheet of extent² with so many points: spacing extent / √count, rounding origin · 2⁻²⁴."""
+    points = np.random.default_rng(0).uniform(0, 1, (count, 3)) * (extent, extent, 0) + origin
+    assert needs_double(points) == double
 
 
 def test_blocks_make_the_same_bytes_as_one(tmp_path):

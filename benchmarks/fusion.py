@@ -1,0 +1,143 @@
+"""Measure the fusion: depth pixels a second, memory, and how both grow with the number of views.
+
+``python -m benchmarks.fusion`` fuses views of a rippled sphere, 640×480 pixels each, along an arc and prints
+a table; a row is a process of its own, so that its peak of the resident memory is its own. A depth pixel is
+counted once, as a pixel of a map; each is compared with ``--neighbours`` views. The CPU's seconds, and the
+pixels by these, hold on a busy machine too. ``--profile`` adds, for the
+smallest number of views, where the time goes on one thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import cProfile
+import json
+import pstats
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_tco.fusion import FusionConfig, FusionMaps, FusionView, fuse
+from colmap_tco.normals import normals_from_depth
+from colmap_tco.pinhole import Pinhole
+
+ROOT = Path(__file__).resolve().parents[1]
+Floats = NDArray[np.float64]
+DISTANCE, STEP = 4.0, 0.06
+"""Distance of the cameras from the middle of the sphere, and radians between two of them."""
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--views", type=int, nargs="+", default=[10, 20, 40])
+    parser.add_argument("--size", type=int, nargs=2, default=(640, 480), metavar=("WIDTH", "HEIGHT"))
+    parser.add_argument("--neighbours", type=int, default=10)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--cache_size", type=float, default=4.0, help="gigabytes")
+    parser.add_argument("--profile", action="store_true")
+    parser.add_argument("--one", action="store_true", help="print the figures of the first number of views")
+    options = parser.parse_args(argv)
+    if options.one:
+        print(json.dumps(measured(options)))
+        return
+    print("| views | neighbours | threads | million depth pixels | points | seconds | CPU seconds "
+          "| million pixels/s | a core | read | held MB | peak MB |\n" + "|---" * 12 + "|")  # fmt: skip
+    for views in options.views:
+        r = in_process(options, views)
+        print(f"| {views} | {options.neighbours} | {options.threads} | {r['pixels'] / 1e6:.2f} "
+              f"| {r['points']:.0f} | {r['seconds']:.2f} | {r['busy']:.2f} "
+              f"| {r['pixels'] / r['seconds'] / 1e6:.2f} | {r['pixels'] / r['busy'] / 1e6:.2f} "
+              f"| {r['loads']:.0f} | {r['held'] / 1e6:.0f} | {r['peak'] / 1e6:.0f} |")  # fmt: skip
+    if options.profile:
+        profile(options)
+
+
+def in_process(options: argparse.Namespace, views: int) -> dict[str, float]:
+    """:func:`measured` in a process of its own."""
+    words = [sys.executable, "-m", "benchmarks.fusion", "--one", "--views", str(views), "--size"]
+    words += [str(side) for side in options.size]
+    for name in ("neighbours", "threads", "cache_size"):
+        words += [f"--{name}", str(getattr(options, name))]
+    figures: dict[str, float] = json.loads(subprocess.check_output(words, cwd=ROOT, text=True))
+    return figures
+
+
+def measured(options: argparse.Namespace) -> dict[str, float]:
+    """Seconds, bytes and counts of one fusion, after a small one that loads the compiled loops."""
+    fuse(scene(3, (96, 72), 2), config(options))
+    views = scene(options.views[0], tuple(options.size), options.neighbours)
+    start, busy = time.perf_counter(), time.process_time()
+    cloud, report = fuse(views, config(options))
+    return {
+        "seconds": time.perf_counter() - start,
+        "busy": time.process_time() - busy,
+        "pixels": report.pixels["all"],
+        "points": len(cloud),
+        "loads": report.loads,
+        "held": report.peak_bytes,
+        "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+    }
+
+
+def config(options: argparse.Namespace) -> FusionConfig:
+    """The defaults with the threads and the cache that were asked for."""
+    return FusionConfig(num_threads=options.threads, cache_size=options.cache_size)
+
+
+def profile(options: argparse.Namespace) -> None:
+    """Print the functions that take the time on one thread, by their own time."""
+    fuse(scene(3, (96, 72), 2), config(options))
+    views = scene(options.views[0], tuple(options.size), options.neighbours)
+    profiler = cProfile.Profile(time.process_time)
+    profiler.runcall(fuse, views, FusionConfig(num_threads=1, cache_size=options.cache_size))
+    pstats.Stats(profiler).sort_stats("tottime").print_stats(25)
+
+
+def scene(count: int, size: tuple[int, int], neighbours: int) -> list[FusionView]:
+    """Views of the sphere along an arc, each made when it is read; the nearest are neighbours."""
+    camera = Pinhole(*size, float(size[0]), float(size[0]), size[0] / 2, size[1] / 2)
+    views = []
+    for i in range(count):
+        others = sorted((j for j in range(count) if j != i), key=lambda j: (abs(i - j), j))[:neighbours]
+        pose = pose_of(i)
+        maps = maps_of(camera, pose)
+        views.append(FusionView(f"{i:04d}.jpg", i, camera, pose, tuple(others), lambda maps=maps: maps))  # type: ignore[misc]
+    return views
+
+
+def pose_of(i: int) -> Floats:
+    """cam_from_world (3, 4) on a spiral around the sphere."""
+    angle, height = STEP * i, 0.6 * np.sin(0.3 * i)
+    eye = np.array([DISTANCE * np.sin(angle), height, -DISTANCE * np.cos(angle)])
+    z = -eye / np.linalg.norm(eye)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(z, x), z])
+    return np.concatenate([rotation, -(rotation @ eye)[:, None]], 1)
+
+
+def maps_of(camera: Pinhole, pose: Floats) -> FusionMaps:
+    """Exact depths of a sphere of radius 1.5 before a larger one of radius 9 around both, from inside."""
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
+    rays = rays @ pose[:, :3]
+    centre = -pose[:, :3].T @ pose[:, 3]
+    a, b, c = (rays**2).sum(-1), rays @ centre, centre @ centre
+    near = b * b - a * (c - 1.5**2)
+    far = (-b + np.sqrt(b * b - a * (c - 9.0**2))) / a
+    depth = np.where(near > 0, (-b - np.sqrt(np.maximum(near, 0))) / a, far).astype(np.float32)
+    image = np.rint(127 + 80 * np.sin(3 * (centre + rays * depth[..., None]))).astype(np.uint8)
+    return FusionMaps(depth, normals_from_depth(depth, camera), image, np.full_like(depth, 5.0))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,88 @@
+"""What the user can tell the fusion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from tco.config import knob
+
+
+@dataclass(frozen=True)
+class FusionConfig:
+    """Which depths agree and which pixels take part; COLMAP's names and defaults where these exist."""
+
+    min_num_pixels: int = knob(
+        5,
+        "Views that must agree on a point, the reference included. A pixel that fewer views could see "
+        "needs all of those, at least 3 (2 where a view has one neighbour). Lower it for few images.",
+    )
+    max_reproj_error: float = knob(
+        2.0,
+        "Largest distance, in pixels of the full image, between a pixel and its way to a neighbour and back.",
+    )
+    max_depth_error: float = knob(
+        0.01, "Largest relative difference between depths that agree: |z − d| / z. Raise it for noisy depths."
+    )
+    max_normal_error: float = knob(10.0, "Largest angle, in degrees, between normals that agree.")
+    check_num_images: int = knob(50, "Neighbours that a view is compared with, the best overlapping first.")
+    cache_size: float = knob(
+        4.0,
+        "Gigabytes of maps and images kept in memory (COLMAP: 32). More saves reading when views are many.",
+    )
+    num_threads: int = knob(-1, "Threads of all stages; -1 is one a core.")
+    min_confidence: float = knob(
+        1.0, "Pixels of a lower confidence are dropped. Confidence is at least 1, so that 1 keeps all."
+    )
+    max_depth_bend: float = knob(
+        0.05,
+        "Pixels beside a discontinuity, where flying points arise, are dropped: those whose inverse depth q "
+        "has a relative second difference |q₋ − 2 q + q₊| / q above this; planes have none. 0: off.",
+    )
+    max_view_angle: float = knob(
+        85.0, "Surfaces seen at a larger angle to their normal, in degrees, are dropped. 90 switches it off."
+    )
+    max_conflicts: float = knob(
+        1.0,
+        "A point is dropped if the views that look through it, to a surface behind, are more than this many "
+        "times the views that agree on it. 0 switches it off.",
+    )
+    adapt_to_noise: bool = knob(
+        True,
+        "Widen max_depth_error, max_reproj_error and max_normal_error to 1.5 times the median difference "
+        "between the views, for depths less exact than those of PatchMatch. Off: the values as given.",
+    )
+    sigma_at_one: float = knob(
+        0.0,
+        "Relative depth error s of a pixel of confidence 1; that of confidence c is s / c. If given, the "
+        "allowed error is max(max_depth_error, √(s²/c₁² + s²/c₂²)), for depths whose confidence is "
+        "calibrated. 0: not used.",
+    )
+    most_depth_error: float = knob(
+        0.05, "Bound of the allowed relative error where adapt_to_noise or sigma_at_one raises it."
+    )
+    max_depth_ratio: float = knob(
+        3.0,
+        "Sky and far background: pixels deeper than this many times the depth that 98 % of the model's "
+        "points in the view do not exceed are dropped. Raise it where a background without points matters. "
+        "0: off.",
+    )
+    min_tri_angle: float = knob(
+        0.25,
+        "Far background: points that the reference and all views that agree with it see within an angle, in "
+        "degrees, smaller than this are dropped: their depth is little more than a guess. 0: off.",
+    )
+    roi: tuple[float, ...] = knob(
+        (),
+        "Keep only points within xmin,ymin,zmin,xmax,ymax,zmax, in the coordinates of the model; the others "
+        "are cut off, those that stay do not change. Empty: all points.",
+    )
+    voxel_size: float = knob(
+        0.0,
+        "Thin the cloud to one point in each cube of this side, in units of the model: the one nearest to "
+        "the middle of the points there. 0: off.",
+    )
+    max_points: int = knob(
+        0,
+        "Thin the cloud evenly in space to at most so many points, by the smallest cubes that do (see "
+        "voxel_size); 3D Gaussian splatting wants 300000 to 500000. 0: off.",
+    )

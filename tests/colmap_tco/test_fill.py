@@ -1,0 +1,165 @@
+"""A PatchMatch result in COLMAP's own undistorted cameras is kept, exact on planes, and its holes filled."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from colmap_tco import _pycolmap
+from colmap_tco.errors import InputError
+from colmap_tco.fill import FillConfig, fill, open_existing
+from colmap_tco.fusion import FusionConfig, fuse
+from colmap_tco.maps import write_map
+from colmap_tco.normals import normals_from_depth
+from colmap_tco.outputs import ViewMaps, fusion_views, undistorted_model, write_model, write_view
+from colmap_tco.pinhole import Pinhole
+from colmap_tco.views import View, ViewConfig, make_views
+from colmap_tco.workspace import DensePaths, Workspace, open_workspace
+from tests.colmap_tco.test_whole_chain import NAMES, NORMAL, PIXEL, workspace_of
+
+Floats = NDArray[np.float64]
+BIAS = 1.003
+"""Of the depths that fill, so that they can be told from those that are kept."""
+
+
+def plane_depth(view: View, camera: Pinhole, shape: tuple[int, int]) -> NDArray[np.float32]:
+    camera = camera.resized(shape[1], shape[0])
+    u, v = np.meshgrid(np.arange(shape[1]) + 0.5, np.arange(shape[0]) + 0.5)
+    rays = np.c_[camera.normalised(np.c_[u.ravel(), v.ravel()]), np.ones(u.size)]
+    R, t = view.cam_from_world[:, :3], view.cam_from_world[:, 3]
+    return (-(-R.T @ t @ NORMAL) / (rays @ R @ NORMAL)).reshape(shape).astype(np.float32)
+
+
+def maps_of(view: View) -> ViewMaps:
+    """What the network would say: the plane at its size, a little too far."""
+    depth = BIAS * plane_depth(view, view.camera, (view.network.height, view.network.width))
+    return ViewMaps(depth, normals_from_depth(depth, view.camera), np.full_like(depth, 3.0))
+
+
+@dataclass(frozen=True)
+class Made:
+    root: Path
+    workspace: Workspace
+    views: list[View]
+    dense: DensePaths
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """COLMAP's undistorter has run; its maps hold the left 60 % of the plane, in all views but the last."""
+    root = tmp_path_factory.mktemp("fill")
+    workspace_of(root, np.zeros(3))
+    dense = DensePaths(root / "dense" / "0")
+    dense.root.mkdir(parents=True)
+    _pycolmap.load().undistort_images(str(dense.root), str(root / "sparse" / "0"), str(root / "images"))
+    workspace = open_workspace(root)
+    views, _ = make_views(workspace, ViewConfig(max_image_size=160), 8)
+    theirs = {entry.name: entry.camera for entry in _pycolmap.registered(_pycolmap.read_model(dense.sparse))}
+    for view in views[:-1]:
+        camera = theirs[view.name]
+        pinhole = Pinhole(camera.width, camera.height, *map(float, camera.params))
+        assert (pinhole.width, pinhole.height) != (view.camera.width, view.camera.height)
+        shape = (pinhole.height // 2, pinhole.width // 2)
+        depth = plane_depth(view, pinhole, shape)
+        depth[:, int(0.6 * shape[1]) :] = 0
+        normal = normals_from_depth(depth, pinhole)
+        write_map(dense.depth_map(view.name), depth)
+        write_map(dense.normal_map(view.name), normal)
+    return Made(root, workspace, views, dense)
+
+
+def config(made: Made) -> FillConfig:
+    return FillConfig(fill_only=str(made.dense.root))
+
+
+def test_kept_depths_are_exact_and_the_others_ours(made: Made) -> None:
+    existing = open_existing(config(made), made.views)
+    assert existing is not None
+    for view in made.views[:-1]:
+        maps, counts = fill(existing, view, maps_of(view))
+        h, w = maps.depth.shape
+        assert w == round(view.camera.width * (existing.cameras[view.name].width // 2)
+                          / existing.cameras[view.name].width)  # fmt: skip
+        ratio = maps.depth / plane_depth(view, view.camera, (h, w))
+        kept = maps.confidence == 30
+        assert 0.4 * h * w < kept.sum() < 0.65 * h * w
+        assert counts == {"pixels_kept": int(kept.sum()), "pixels_filled": int(h * w - kept.sum())}
+        assert np.abs(ratio[kept] - 1).max() < 1e-4
+        assert np.abs(ratio[~kept] / BIAS - 1).max() < 1e-4
+        assert (maps.confidence[~kept] == 3).all()
+        assert np.median(np.abs(maps.normal @ view.cam_from_world[:, :3] - NORMAL)) < 0.01
+
+
+def test_views_without_a_map_stay_as_they_are(made: Made) -> None:
+    existing = open_existing(config(made), made.views)
+    assert existing is not None and NAMES[-1] not in existing.cameras
+    ours = maps_of(made.views[-1])
+    maps, counts = fill(existing, made.views[-1], ours)
+    assert maps is ours
+    assert counts == {"pixels_kept": 0, "pixels_filled": ours.depth.size}
+
+
+def test_the_fused_cloud_keeps_the_place_of_what_was_kept(made: Made, tmp_path: Path) -> None:
+    existing, paths = open_existing(config(made), made.views), DensePaths(tmp_path)
+    assert existing is not None
+    for view in made.views:
+        write_view(paths, view, fill(existing, view, maps_of(view))[0])
+    indices = write_model(paths, undistorted_model(made.workspace.model, made.views))
+    neighbours = {name: [other for other in NAMES if other != name] for name in NAMES}
+    cloud, _ = fuse(
+        fusion_views(paths, made.views, neighbours, indices), FusionConfig(num_threads=1, max_normal_error=30)
+    )
+    assert len(cloud) > 10_000
+    off = cloud.points @ NORMAL
+    # Where all is kept the plane, elsewhere the bias: 0.3 % of the depth, moved along the normal.
+    kept = np.abs(off) < 0.1 * PIXEL
+    assert 0.3 < kept.mean() < 0.9
+    assert abs(off[kept].mean()) < 0.02 * PIXEL
+
+
+def test_a_result_of_other_cameras_is_refused(made: Made) -> None:
+    first = made.views[0]
+    pose = first.cam_from_world.copy()
+    pose[:, 3] += 0.01
+    with pytest.raises(InputError, match=r"0\.png is turned by .* and moved by .*image_undistorter"):
+        open_existing(config(made), [replace(first, cam_from_world=pose), *made.views[1:]])
+
+
+def test_folders_without_a_result_are_named(made: Made, tmp_path: Path) -> None:
+    assert open_existing(FillConfig(), made.views) is None
+    with pytest.raises(InputError, match="no sparse; name the dense workspace"):
+        open_existing(FillConfig(fill_only=str(tmp_path)), made.views)
+    shutil.copytree(made.dense.root, tmp_path / "copy")
+    copy = DensePaths(tmp_path / "copy")
+    copy.normal_map(NAMES[0]).unlink()
+    with pytest.raises(InputError, match=r"0\.png\.geometric\.bin is missing"):
+        open_existing(FillConfig(fill_only=str(copy.root)), made.views)
+    for name in NAMES:
+        copy.depth_map(name).unlink(missing_ok=True)
+    with pytest.raises(InputError, match=r"no geometric depth map of these views.*geom_consistency"):
+        open_existing(FillConfig(fill_only=str(copy.root)), made.views)
+    with pytest.raises(InputError, match="at least 1"):
+        open_existing(FillConfig(fill_only=str(copy.root), kept_confidence=0.5), made.views)
+
+
+def test_distorted_cameras_are_refused(made: Made, tmp_path: Path) -> None:
+    shutil.copytree(made.dense.root, tmp_path / "copy")
+    shutil.rmtree(tmp_path / "copy" / "sparse")
+    shutil.copytree(made.root / "sparse" / "0", tmp_path / "copy" / "sparse")
+    with pytest.raises(InputError, match="OPENCV camera, not undistorted"):
+        open_existing(FillConfig(fill_only=str(tmp_path / "copy")), made.views)
+
+
+def test_maps_of_different_sizes_are_refused(made: Made, tmp_path: Path) -> None:
+    shutil.copytree(made.dense.root, tmp_path / "copy")
+    copy = DensePaths(tmp_path / "copy")
+    write_map(copy.normal_map(NAMES[0]), np.zeros((4, 5, 3), np.float32))
+    existing = open_existing(FillConfig(fill_only=str(copy.root)), made.views)
+    assert existing is not None
+    with pytest.raises(InputError, match="does not fit the depths"):
+        fill(existing, made.views[0], maps_of(made.views[0]))
