@@ -59,7 +59,7 @@ def write_openmvs(dense: Dense, folder: Path) -> str:
     place = np.array([order[view.name] for view in dense.views], np.uint32)
     write_ply(target.ply, cloud.points, cloud.normals, cloud.colors)
     write_vis(target.vis, Visibility(cloud.visibility.start, place[cloud.visibility.images]))
-    return f"{len(views)} images with depth maps, {len(cloud)} points; InterfaceCOLMAP -i {folder.name} reads it"
+    return f"{len(views)} images with depth maps, {len(cloud)} points; read it with InterfaceCOLMAP -i"
 
 
 def _write_sparse(dense: Dense, views: list[DenseView], names: dict[str, str], folder: Path) -> None:
