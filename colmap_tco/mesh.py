@@ -68,7 +68,9 @@ class MeshConfig:
         4.0,
         "Vertices further from the cloud than so many cells are dropped: bubbles, flying pixels. inf: off.",
     )
-    min_part: float = knob(0.001, "Connected parts of less than this share of all triangles are dropped. 0: off.")
+    min_part: float = knob(
+        0.001, "Connected parts of less than this share of all triangles are dropped. 0: off."
+    )
     overwrite: bool = knob(False, "Replace an earlier mesh.")
 
     def __post_init__(self) -> None:
@@ -136,13 +138,16 @@ def mesh(root: Path, config: MeshConfig, progress: Progress) -> Meshed:
     _drop_small_parts(surface, config.min_part, dropped)
     if not len(surface.triangles):
         raise InputError(
-            f"{dense.paths.root}: no triangle is left ({dropped}); raise --max_distance, --trim or --cell_size"
+            f"{dense.paths.root}: no triangle is left ({dropped}); raise --max_distance, --trim or "
+            "--cell_size"
         )
     surface.translate(centre)
     surface.compute_vertex_normals()
     with atomic_path(path) as unfinished:
         if not o3d.io.write_triangle_mesh(str(unfinished), surface):
-            raise InputError(f"{path}: Open3D could not write it; is there space, and may the folder be written to?")
+            raise InputError(
+                f"{path}: Open3D could not write it; is there space, and may the folder be written to?"
+            )
     return Meshed(path, len(surface.vertices), len(surface.triangles), dropped)
 
 
@@ -173,7 +178,7 @@ def _poisson(o3d: Any, local: Floats, cloud: Cloud, cell: float) -> tuple[Triang
 
 
 def _tsdf(o3d: Any, dense: Dense, centre: Floats, cell: float, progress: Progress) -> TriangleMesh:
-    """The surface on which the average signed distance of the depth maps is zero; ``centre`` is the origin."""
+    """The surface where the mean signed distance of the depth maps is zero; ``centre`` is the origin."""
     volume = o3d.pipelines.integration.ScalableTSDFVolume(
         voxel_length=cell,
         sdf_trunc=_TRUNCATION * cell,
@@ -187,11 +192,13 @@ def _tsdf(o3d: Any, dense: Dense, centre: Floats, cell: float, progress: Progres
 
 
 def _rgbd(o3d: Any, dense: Dense, view: DenseView, depth: NDArray[np.float32]) -> tuple[Any, Any]:
-    """Depth and colour in the pixels of the depth map, and Open3D's camera, whose pixel centres are integers."""
+    """Depth and colour in the pixels of the depth map, and Open3D's camera: its pixel centres are integers."""
     import cv2
 
     height, width = depth.shape
-    image = cv2.resize(read_image(dense.paths.image(view.name)), (width, height), interpolation=cv2.INTER_AREA)
+    image = cv2.resize(
+        read_image(dense.paths.image(view.name)), (width, height), interpolation=cv2.INTER_AREA
+    )
     fx, fy, cx, cy = map_intrinsics(view.camera, depth.shape)
     rgbd = o3d.geometry.RGBDImage.create_from_color_and_depth(
         o3d.geometry.Image(np.ascontiguousarray(image)),

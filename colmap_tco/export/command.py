@@ -87,7 +87,9 @@ def export(format: str, root: Path, config: ExportConfig, progress: Progress) ->
         told = write_las(dense, target, config.points(0), config.seed)
     else:
         target = config.output_path or dense.paths.root.with_name(f"{dense.paths.root.name}-{format}")
-        told = _into_folder(target, config.overwrite, lambda folder: _write_folder(format, dense, folder, config))
+        told = _into_folder(
+            target, config.overwrite, lambda folder: _write_folder(format, dense, folder, config)
+        )
     progress.advance(1)
     return Exported(target, told)
 

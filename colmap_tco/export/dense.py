@@ -71,7 +71,7 @@ class Dense:
                 f"{self.paths.vis} names image {visibility.images.max()}, {self.paths.sparse} has "
                 f"{len(self.views)}: they are of different runs; fuse again"
             )
-        return Cloud(points, normals, colors, visibility)
+        return Cloud(points.astype(np.float64), normals.astype(np.float32), colors, visibility)
 
 
 def open_dense(root: Path) -> Dense:
@@ -84,8 +84,8 @@ def open_dense(root: Path) -> Dense:
     found = [p for p in (dense_paths(root), DensePaths(root)) if p.sparse.is_dir() and p.stereo.is_dir()]
     if not found:
         raise InputError(
-            f"{root}: no dense workspace, neither {dense_paths(root).root.name}/ in it nor sparse/ and stereo/; "
-            f"make it with: colmap-tco densify {root}"
+            f"{root}: no dense workspace, neither {dense_paths(root).root.name}/ in it nor sparse/ and "
+            f"stereo/; make it with: colmap-tco densify {root}"
         )
     paths = found[0]
     model = _pycolmap.read_model(paths.sparse)
@@ -95,8 +95,8 @@ def open_dense(root: Path) -> Dense:
         entry = entries[int(key)]
         if entry.camera.model.name != "PINHOLE":
             raise InputError(
-                f"{paths.sparse}: {entry.name} has a {entry.camera.model.name} camera, where a dense workspace "
-                "has PINHOLE; undistort the images with colmap image_undistorter"
+                f"{paths.sparse}: {entry.name} has a {entry.camera.model.name} camera, where a dense "
+                "workspace has PINHOLE; undistort the images with colmap image_undistorter"
             )
         fx, fy, cx, cy = map(float, entry.camera.params)
         pinhole = Pinhole(*_pycolmap.camera_size(entry.camera), fx, fy, cx, cy)

@@ -79,7 +79,7 @@ def scale_and_offset(points: NDArray[np.float64], distance: float) -> tuple[floa
     offset = np.round((low + high) / 2 / scale) * scale
     if (high - low).max() / 2 / scale >= _LARGEST:
         raise InputError(
-            f"the cloud extends over {(high - low).max():g} with points {distance:g} apart, more than the numbers "
-            "of a LAS file hold; cut its far background away"
+            f"the cloud extends over {(high - low).max():g} with points {distance:g} apart, more than the "
+            "numbers of a LAS file hold; cut its far background away"
         )
     return scale, offset

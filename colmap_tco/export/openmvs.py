@@ -53,7 +53,9 @@ def write_openmvs(dense: Dense, folder: Path) -> str:
     write_text(target.patch_match_cfg, "".join(lines))
     write_text(target.fusion_cfg, "".join(f"{names[view.name]}\n" for view in views))
     if len(listed) < len(views):
-        log.warning("%d images have no neighbours: no other sees a point that they see", len(views) - len(listed))
+        log.warning(
+            "%d images have no neighbours: no other sees a point that they see", len(views) - len(listed)
+        )
     cloud = dense.cloud()
     order = {view.name: i for i, view in enumerate(views)}
     place = np.array([order[view.name] for view in dense.views], np.uint32)
@@ -79,7 +81,13 @@ def _write_sparse(dense: Dense, views: list[DenseView], names: dict[str, str], f
     flat = flat[np.lexsort((flat[:, 1], flat[:, 0]))]
     start = np.concatenate([[0], np.bincount(flat[:, 0] - 1, minlength=len(ids)).cumsum()])
     points3d = SparsePoints(
-        np.arange(1, len(ids) + 1), xyz, rgb, _pycolmap.point_errors(dense.model), start, flat[:, 1], flat[:, 2]
+        np.arange(1, len(ids) + 1),
+        xyz,
+        rgb,
+        _pycolmap.point_errors(dense.model),
+        start,
+        flat[:, 1],
+        flat[:, 2],
     )
     write_model_text(folder, SparseModel({cameras[v.camera_id]: v.camera for v in views}, images, points3d))
 
@@ -99,19 +107,24 @@ def _write_maps(dense: Dense, views: list[DenseView], names: dict[str, str], tar
 
 def _neighbours(dense: Dense, views: list[DenseView]) -> dict[str, list[str]]:
     """Name → names of its neighbours: those listed, else those with which it shares most points."""
-    known = {view.name for view in views}
-    found: dict[str, list[str]] = {view.name: [] for view in views}
-    path = dense.paths.patch_match_cfg
-    text = path.read_text("utf-8") if path.is_file() else ""
-    lines = [line for line in text.splitlines() if line and not line.startswith("#")]
-    for name, listed in zip(lines[::2], lines[1::2], strict=False):
-        if name in known:
-            found[name] = [n for n in map(str.strip, listed.split(",")) if n in known and n != name]
-    if all(found.values()):
+    found = _listed_neighbours(dense.paths.patch_match_cfg, {view.name for view in views})
+    if len(found) == len(views):
         return found
     common = covisibility(read_tracks(dense.model), [view.image_id for view in views]).common
     for i, view in enumerate(views):
-        if not found[view.name]:
-            best = [int(j) for j in np.argsort(-common[i], kind="stable")[:MOST_NEIGHBOURS] if j != i]
+        if view.name not in found:
+            best = np.argsort(-common[i], kind="stable")[:MOST_NEIGHBOURS].tolist()
             found[view.name] = [views[j].name for j in best if common[i, j] > 0]
+    return {view.name: found[view.name] for view in views}
+
+
+def _listed_neighbours(path: Path, known: set[str]) -> dict[str, list[str]]:
+    """Name → names of the neighbours in an explicit list of patch-match.cfg, where there is one."""
+    text = path.read_text("utf-8") if path.is_file() else ""
+    lines = [line for line in text.splitlines() if line and not line.startswith("#")]
+    found = {}
+    for name, listed in zip(lines[::2], lines[1::2], strict=False):
+        others = [n for n in map(str.strip, listed.split(",")) if n in known and n != name]
+        if name in known and others:
+            found[name] = others
     return found

@@ -43,7 +43,9 @@ def dense_model(dense: Dense, cloud: Cloud, names: Mapping[str, str]) -> tuple[S
     seen = np.isfinite(xy).all(1)
     enough = np.bincount(owner[seen], minlength=len(cloud)) >= FEWEST_VIEWS
     if not enough.any():
-        raise InputError(f"{dense.paths.ply}: no point lies in two of the images that {dense.paths.vis.name} names")
+        raise InputError(
+            f"{dense.paths.ply}: no point lies in two of the images that {dense.paths.vis.name} names"
+        )
     if not enough.all():
         log.info("%d points are left out: they fall into fewer than two images", int((~enough).sum()))
     seen &= enough[owner]
@@ -66,7 +68,9 @@ def _model(
         mine = np.flatnonzero(position == i)
         keypoints[mine] = np.arange(len(mine))
         images.append(
-            SparseImage(view.image_id, names[view.name], view.camera_id, view.cam_from_world, xy[mine], point[mine])
+            SparseImage(
+                view.image_id, names[view.name], view.camera_id, view.cam_from_world, xy[mine], point[mine]
+            )
         )
     ids = np.array([view.image_id for view in dense.views], np.int64)
     start = np.zeros(len(cloud) + 1, np.int64)

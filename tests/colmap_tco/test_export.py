@@ -48,7 +48,9 @@ def exported(format: str, root: Path, out: Path, **settings: object) -> Path:
     return export(format, root, ExportConfig(output_path=out, **settings), Progress()).path  # type: ignore[arg-type]
 
 
-def write_double_ply(path: Path, points: Floats, normals: NDArray[np.float32], colors: NDArray[np.uint8]) -> None:
+def write_double_ply(
+    path: Path, points: Floats, normals: NDArray[np.float32], colors: NDArray[np.uint8]
+) -> None:
     kinds = [(n, "<f8") for n in "xyz"] + [(f"n{n}", "<f4") for n in "xyz"]
     records = np.zeros(len(points), [*kinds, ("red", "u1"), ("green", "u1"), ("blue", "u1")])
     for axis, name in enumerate("xyz"):
@@ -227,7 +229,9 @@ def test_openmvs_finds_maps_neighbours_and_visibility_by_its_rules(
         np.testing.assert_allclose(row[4:], view.cam_from_world[:, 3])
 
 
-def test_openmvs_gets_the_triangulated_points_with_their_tracks(root: Path, dense: Dense, tmp_path: Path) -> None:
+def test_openmvs_gets_the_triangulated_points_with_their_tracks(
+    root: Path, dense: Dense, tmp_path: Path
+) -> None:
     paths = DensePaths(exported("openmvs", root, tmp_path / "mvs"))
     model = _pycolmap.load().Reconstruction(str(paths.sparse))
     assert len(model.points3D) == len(dense.model.points3D) > 100
@@ -321,7 +325,7 @@ def test_scale_is_a_power_of_ten_below_the_precision() -> None:
 
 
 def test_map_coordinates_cost_no_pixels(mapped: Path, tmp_path: Path) -> None:
-    """Keypoints are those of the same cloud at the origin, though world coordinates have seven digits more."""
+    """Keypoints are those of the same cloud at the origin, though coordinates have seven digits more."""
     folder = exported("3dgs", mapped, tmp_path / "out")
     model = _pycolmap.load().Reconstruction(str(folder / "sparse" / "0"))
     points = read_ply(mapped / "fused.ply")[0] - ORIGIN
@@ -376,7 +380,9 @@ def test_folders_of_others_are_not_replaced(root: Path, tmp_path: Path) -> None:
         ("sparse", "colmap-tco densify"),
     ],
 )
-def test_what_is_missing_is_named_and_nothing_is_left(root: Path, tmp_path: Path, lost: str, told: str) -> None:
+def test_what_is_missing_is_named_and_nothing_is_left(
+    root: Path, tmp_path: Path, lost: str, told: str
+) -> None:
     dense = tmp_path / "w" / "dense-tco"
     shutil.copytree(root / "dense-tco", dense)
     (shutil.rmtree if (dense / lost).is_dir() else Path.unlink)(dense / lost)

@@ -69,7 +69,8 @@ def test_pycolmap_meshes_the_cloud(paths: DensePaths, tmp_path: Path) -> None:
 def test_the_colmap_command_meshes_the_cloud(paths: DensePaths, tmp_path: Path) -> None:
     out = tmp_path / "m.ply"
     colmap("poisson_mesher", "--input_path", str(paths.ply), "--output_path", str(out),
-           "--PoissonMeshing.depth", "7", "--PoissonMeshing.trim", "4", "--PoissonMeshing.num_threads", "1")  # fmt: skip
+           "--PoissonMeshing.depth", "7", "--PoissonMeshing.trim", "4",
+           "--PoissonMeshing.num_threads", "1")  # fmt: skip
     assert_plane(mesh_vertices(out), read_ply(paths.ply)[0])
 
 
@@ -77,8 +78,8 @@ def test_the_colmap_command_makes_a_delaunay_mesh_of_cloud_and_visibility(
     paths: DensePaths, tmp_path: Path
 ) -> None:
     out = tmp_path / "m.ply"
-    colmap("delaunay_mesher", "--input_path", str(paths.root), "--input_type", "dense", "--output_path", str(out),
-           "--DelaunayMeshing.num_threads", "1")  # fmt: skip
+    colmap("delaunay_mesher", "--input_path", str(paths.root), "--input_type", "dense",
+           "--output_path", str(out), "--DelaunayMeshing.num_threads", "1")  # fmt: skip
     assert_plane(mesh_vertices(out), read_ply(paths.ply)[0])
 
 
@@ -112,7 +113,9 @@ def test_the_colmap_command_converts_the_splatting_export(paths: DensePaths, tmp
     xyz = np.array([[float(word) for word in words[1:4]] for words in lines])
     assert np.abs(xyz - points).max() < 1e-4
     model = _pycolmap.load().Reconstruction(str(out / "sparse" / "0"))
-    assert sum(len(words) - 8 for words in lines) == 2 * sum(p.track.length() for p in model.points3D.values())
+    assert sum(len(words) - 8 for words in lines) == 2 * sum(
+        p.track.length() for p in model.points3D.values()
+    )
 
 
 def test_the_colmap_command_reads_the_text_export(paths: DensePaths, tmp_path: Path) -> None:
