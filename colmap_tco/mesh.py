@@ -192,7 +192,7 @@ def _tsdf(o3d: Any, dense: Dense, centre: Floats, cell: float, progress: Progres
 
 
 def _rgbd(o3d: Any, dense: Dense, view: DenseView, depth: NDArray[np.float32]) -> tuple[Any, Any]:
-    """Depth and colour in the pixels of the depth map, and Open3D's camera: its pixel centres are integers."""
+    """Depth and colour in pixels of the depth map, and Open3D's camera (pixel centres are integers)."""
     import cv2
 
     height, width = depth.shape
