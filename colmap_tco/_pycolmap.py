@@ -204,6 +204,11 @@ def points(model: Model) -> tuple[Ints, Floats, NDArray[np.uint8]]:
     return ids, xyz, rgb
 
 
+def point_errors(model: Model) -> Floats:
+    """Mean reprojection errors (P,) in pixels of the 3D points, ordered by id."""
+    return np.array([point.error for _, point in sorted(model.points3D.items())], float)
+
+
 @dataclass(frozen=True)
 class PinholeImage:
     """One image of a model to be written by :func:`pinhole_model`.

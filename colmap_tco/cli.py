@@ -50,6 +50,7 @@ class Argument(NamedTuple):
 
 
 WORKSPACE = Argument("workspace", "folder with images/ and, unless it is to be made, a COLMAP model")
+DENSE = Argument("workspace", "folder with dense-tco/, or any dense workspace of COLMAP")
 
 
 class Command(NamedTuple):
@@ -97,6 +98,18 @@ COMMANDS: dict[str, Command] = {
             Argument("action", "what to do", str, ("list", "fetch", "path", "verify")),
             Argument("network", "whose weights, as the list names it", str, optional=True),
         ),
+    ),
+    "export": Command(
+        "write a finished result for trainers of Gaussian splats, OpenMVS, surveyors (LAS, LAZ) or as text",
+        "colmap_tco.export.command:ExportConfig",
+        "colmap_tco.export.command:export",
+        (Argument("format", "what to write", str, ("3dgs", "openmvs", "las", "text")), DENSE),
+    ),
+    "mesh": Command(
+        "make a coloured mesh of a finished result",
+        "colmap_tco.mesh:MeshConfig",
+        "colmap_tco.mesh:mesh",
+        (DENSE,),
     ),
 }
 

@@ -35,6 +35,7 @@ class Setting:
         default: the value where no flag is given.
         help: what the setting does.
         owner: the dataclass that declares the field.
+        alias: a short flag beside the long one, or empty; switches have none.
     """
 
     name: str
@@ -45,11 +46,14 @@ class Setting:
     default: Any
     help: str
     owner: type
+    alias: str = ""
 
     @property
     def flags(self) -> tuple[str, ...]:
-        """The spellings with underscores: one, or two for a switch."""
-        return (f"--{self.name}", f"--no_{self.name}") if self.base is bool else (f"--{self.name}",)
+        """The spellings with underscores: one, two for a switch, and a short one if there is any."""
+        if self.base is bool:
+            return (f"--{self.name}", f"--no_{self.name}")
+        return (f"--{self.name}", self.alias) if self.alias else (f"--{self.name}",)
 
     def parse(self, text: str) -> Any:
         """The value that a word of the command line stands for.
@@ -202,9 +206,8 @@ def _walk(config_type: type, defaults: Any) -> Iterator[Setting]:
             raise TypeError(f"{where} has no help: declare it with tco.config.knob")
         base, optional, many = _kind(hint, where)
         choices = field.metadata.get("choices")
-        setting = Setting(
-            field.name, base, optional, many, choices, default, field.metadata["help"], config_type
-        )
+        told, alias = field.metadata["help"], field.metadata.get("alias", "")
+        setting = Setting(field.name, base, optional, many, choices, default, told, config_type, alias)
         _check_default(setting, where)
         yield setting
 

@@ -23,6 +23,7 @@ from colmap_tco.errors import DensifyError
 from colmap_tco.fusion_input import FusionMaps, FusionView
 from colmap_tco.maps import read_map, write_map
 from colmap_tco.ply import Cloud, needs_double, write_ply, write_vis
+from colmap_tco.sparse_format import reorder_images
 from colmap_tco.tracks import Tracks
 from colmap_tco.views import View, undistorted_image
 from colmap_tco.workspace import DensePaths, read_image
@@ -125,7 +126,10 @@ def write_model(paths: DensePaths, model: Model) -> dict[str, int]:
         model.write(folder)
         for file in sorted(Path(folder).iterdir()):
             os.replace(file, paths.sparse / file.name)
-    return image_positions(paths)
+    positions = image_positions(paths)
+    ids = {image.name: int(key) for key, image in model.images.items()}
+    reorder_images(paths.sparse / "images.bin", [ids[name] for name in positions])
+    return positions
 
 
 def image_positions(paths: DensePaths) -> dict[str, int]:

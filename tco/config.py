@@ -8,10 +8,10 @@ from typing import TypeVar
 T = TypeVar("T")
 
 
-def knob(default: T, help: str, choices: tuple[str, ...] | None = None) -> T:
-    """A dataclass field with a default, a help text and, for text, the values that it may take.
+def knob(default: T, help: str, choices: tuple[str, ...] | None = None, alias: str = "") -> T:
+    """A dataclass field with a default, a help text, the values that a text may take, and a short flag.
 
     The command line is generated from these; ``help`` says what the setting does, in which unit,
     and when to change it.
     """
-    return field(default=default, metadata={"help": help, "choices": choices})
+    return field(default=default, metadata={"help": help, "choices": choices, "alias": alias})

@@ -122,6 +122,16 @@ def test_a_bare_double_dash_ends_the_flags() -> None:
     assert flags.normalise(["--a-b=c-d", "x-y", "--", "--a-b"]) == ["--a_b=c-d", "x-y", "--", "--a-b"]
 
 
+def test_a_setting_can_have_a_short_flag() -> None:
+    @dataclass(frozen=True)
+    class Short:
+        output_path: Optional[Path] = knob(None, "where to", alias="-o")  # noqa: UP045
+
+    for words in (["-o", "x-y"], ["--output-path", "x-y"], ["--output_path=x-y"]):
+        assert parse(Short, words).output_path == Path("x-y")
+    assert parse(Short, []).output_path is None
+
+
 def test_negative_numbers_are_values() -> None:
     assert parse(Outer, ["--steps", "-1"]).steps == -1
 

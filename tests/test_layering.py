@@ -37,6 +37,9 @@ START_UP = (
     "memory",
     "attempts",
     "check",
+    "export/command",
+    "export/dense",
+    "mesh",
 )
 """Modules of ``colmap_tco`` that the command line imports for their settings: nothing in LAZY at the top."""
 

@@ -104,7 +104,7 @@ def test_every_third_party_import_is_declared() -> None:
 
 def test_the_pins_lie_in_the_declared_ranges() -> None:
     versions = pins()
-    for requirement in requirements("hub", "dev"):
+    for requirement in requirements("hub", "las", "dev"):
         name = canonicalize_name(requirement.name)
         assert name in versions, f"constraints.txt does not pin {name}"
         assert versions[name] in requirement.specifier, f"{name} {versions[name]} is outside its range"
@@ -112,7 +112,7 @@ def test_the_pins_lie_in_the_declared_ranges() -> None:
 
 def test_every_dependency_of_a_dependency_is_pinned() -> None:
     """A fresh machine must get the same versions tomorrow: nothing is left for pip to choose."""
-    versions, seen, left = pins(), set(), requirements("hub", "dev")
+    versions, seen, left = pins(), set(), requirements("hub", "las", "dev")
     while left:
         requirement = left.pop()
         name = canonicalize_name(requirement.name)
@@ -143,9 +143,23 @@ def checkout(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def programs(folder: Path, **does: str) -> str:
+    """A PATH with what the scripts need, and shell scripts with these names and contents."""
+    folder.mkdir()
+    for name in ("bash", "sh", "make", "dirname", "test", "python3", "touch", "rm", "true", "false"):
+        (folder / name).symlink_to(str(shutil.which(name)))
+    for name, script in does.items():
+        path = folder / name.replace("_", "-")
+        path.write_text(f"#!/bin/sh\n{script}\n")
+        path.chmod(0o755)
+    return str(folder)
+
+
 def ci(checkout: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     # make hands its own flags down, which would change what is tested under `make test`
     inherited = {name: value for name, value in os.environ.items() if name not in ("MAKEFLAGS", "MFLAGS")}
+    if "PATH" not in environment:  # nothing is installed while tests run
+        environment["PATH"] = programs(checkout / "programs", colmap="true")
     command = ["bash", str(checkout / ".ci/run")]
     return subprocess.run(
         command, env={**inherited, **environment}, cwd="/", capture_output=True, text=True, check=False
@@ -178,3 +192,23 @@ def test_ci_stops_at_the_first_failure(checkout: Path, broken: str | None, ran: 
     )
     assert started == (ran or ["ruff check", "ruff format", "mypy", "pytest"])
     assert (done.returncode == 0) is (broken is None)
+
+
+@pytest.mark.parametrize("works", [True, False])
+def test_ci_installs_colmap_or_says_that_it_cannot(checkout: Path, works: bool) -> None:
+    script = f"echo apt-get $* >> {checkout}/calls\n" + ("exit 0" if works else "exit 100")
+    path = programs(checkout / "programs", apt_get=script)
+    done = ci(checkout, PATH=path, MAKEFLAGS="n")
+    assert done.returncode == 0, done.stderr
+    calls = (checkout / "calls").read_text().splitlines()
+    assert calls[0] == "apt-get update"
+    assert (calls[1:] == ["apt-get install -y --no-install-recommends colmap"]) is works
+    assert ("colmap could not be installed" in done.stderr) is not works
+    assert "-m pytest" in done.stdout
+
+
+def test_ci_does_not_install_what_is_there(checkout: Path) -> None:
+    script = f"echo called >> {checkout}/calls"
+    done = ci(checkout, PATH=programs(checkout / "programs", apt_get=script, colmap="true"), MAKEFLAGS="n")
+    assert done.returncode == 0, done.stderr
+    assert not (checkout / "calls").exists()

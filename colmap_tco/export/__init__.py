@@ -1,0 +1,1 @@
+"""A dense workspace in the formats of other programs, one module a format."""
