@@ -84,6 +84,11 @@ COMMANDS: dict[str, Command] = {
         "colmap_tco.densify:DensifyConfig",
         "colmap_tco.densify:densify",
     ),
+    "report": Command(
+        "make the page of a finished result anew and open it in the browser",
+        "colmap_tco.show:ReportConfig",
+        "colmap_tco.show:show_report",
+    ),
     "check": Command(
         "show what this machine has, what each network would need, and which one would run",
         "colmap_tco.check:CheckConfig",

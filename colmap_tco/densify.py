@@ -26,6 +26,7 @@ from colmap_tco.fusion import EmptyCloudError, FusionConfig, fuse
 from colmap_tco.lock import locked
 from colmap_tco.mapping import MappingConfig, ensure_model
 from colmap_tco.memory import release
+from colmap_tco.page.write import write_page
 from colmap_tco.predict import ChunkResult, predict_chunk
 from colmap_tco.priors import PriorConfig, with_points
 from colmap_tco.progress import Progress
@@ -47,6 +48,9 @@ class DensifyConfig:
     overwrite: bool = knob(False, "replace an earlier result that was made with other settings")
     refine_cameras: bool = knob(
         False, "write the cameras as corrected by the optimisation instead of COLMAP's own"
+    )
+    report_page: bool = knob(
+        True, "write report.html too, the result as one page for the browser (a few megabytes)"
     )
     network: NetworkConfig = field(default_factory=NetworkConfig)
     tco: TCOConfig = field(default_factory=TCOConfig)
@@ -171,6 +175,8 @@ def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified
         "seconds": clock.seconds,
     }
     outputs.write_report(result.paths.report, figures)
+    if config.report_page:
+        write_page(result.paths, json.loads(result.paths.report.read_text("utf-8")))
     folder = result.publish().root
     return Densified(folder, json.loads((folder / "report.json").read_text("utf-8")), fresh=True)
 
@@ -221,7 +227,7 @@ def _fingerprints(
 ) -> tuple[str, str]:
     """Two texts: one changes with everything that decides the result, one with what decides the maps."""
     kept = dataclasses.replace(
-        config, overwrite=False, fusion=dataclasses.replace(config.fusion, num_threads=-1)
+        config, overwrite=False, report_page=True, fusion=dataclasses.replace(config.fusion, num_threads=-1)
     )
     mapped = dataclasses.replace(kept, refine_cameras=False, fusion=FusionConfig())
     masks = [view.mask_path for view in views if view.mask_path is not None]
