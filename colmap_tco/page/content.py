@@ -58,7 +58,7 @@ def content(paths: DensePaths, report: Mapping[str, Any], limits: Limits = Limit
     held = (float(settings["priors"]["holdout"]), int(settings["seed"]))
     most = max(50, limits.observations // max(len(views), 1))
     shown = {
-        view.name: camera_of(view) | {"points": errors_at_points(paths, tracks, view, held, most)}
+        view.name: camera_of(view) | {"errors": errors_at_points(paths, tracks, view, held, most)}
         for view in views
     }
     for name, maps in all_maps(paths, views, limits).items():

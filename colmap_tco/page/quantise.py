@@ -62,8 +62,8 @@ def level_values(codes: NDArray[np.uint8], low: float, high: float) -> NDArray[n
 
 def normal_codes(normal: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Codes (H, W, 3) of unit normals (H, W, 3); none, (0, 0, 0), is 128 thrice."""
-    codes: NDArray[np.uint8] = (_NORMAL_ZERO + _NORMAL_STEP * np.rint(NORMAL_LEVELS * normal)).astype(np.uint8)
-    return codes
+    steps = np.rint(NORMAL_LEVELS * np.asarray(normal, np.float64))
+    return np.asarray(_NORMAL_ZERO + _NORMAL_STEP * steps, np.uint8)
 
 
 def normal_values(codes: NDArray[np.uint8]) -> NDArray[np.float64]:

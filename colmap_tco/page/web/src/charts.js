@@ -24,12 +24,12 @@ function line(values, x, y) {
 function curve(name, values, width) {
   const there = values.filter((v) => v !== null && Number.isFinite(v));
   if (!there.length) return null;
-  const mean = smooth(values, width), low = Math.min(0, ...there), high = Math.max(...there) || 1, n = Math.max(1, values.length - 1);
-  const x = (i) => 46 + 264 * i / n, y = (v) => 118 - 104 * (v - low) / (high - low || 1), show = name === 'held_out' ? percent : digits;
+  const mean = smooth(values, width), high = Math.max(...there) || 1, least = Math.min(...there), low = least > 0.3 * high ? least - 0.15 * (high - least) : Math.min(0, least), n = Math.max(1, values.length - 1);
+  const x = (i) => 54 + 256 * i / n, y = (v) => 118 - 104 * (v - low) / (high - low || 1), show = name === 'held_out' ? percent : digits;
   const svg = make('svg', { viewBox: '0 0 320 140', role: 'img', 'aria-label': `${TERMS[name] || name}, from ${show(there[0])} to ${show(there[there.length - 1])}` },
-    make('line', { class: 'axis', x1: 46, x2: 310, y1: 118, y2: 118 }), make('line', { class: 'axis', x1: 46, x2: 46, y1: 14, y2: 118 }),
-    make('text', { x: 42, y: 18, 'text-anchor': 'end' }, show(high)), make('text', { x: 42, y: 121, 'text-anchor': 'end' }, show(low)),
-    make('text', { x: 46, y: 133 }, '1'), make('text', { x: 310, y: 133, 'text-anchor': 'end' }, `step ${values.length}`),
+    make('line', { class: 'axis', x1: 54, x2: 310, y1: 118, y2: 118 }), make('line', { class: 'axis', x1: 54, x2: 54, y1: 14, y2: 118 }),
+    make('text', { x: 50, y: 18, 'text-anchor': 'end' }, show(high)), make('text', { x: 50, y: 121, 'text-anchor': 'end' }, show(low)),
+    make('text', { x: 54, y: 133 }, '1'), make('text', { x: 310, y: 133, 'text-anchor': 'end' }, `step ${values.length}`),
     make('path', { class: 'raw', d: line(values, x, y) }), make('path', { class: 'mean', d: line(mean, x, y) }));
   return make('figure', { 'data-term': name }, make('h3', {}, TERMS[name] || name.replaceAll('_', ' ')), svg);
 }
@@ -62,19 +62,19 @@ export function startMap(holder) {
   const canvas = make('canvas', { width: W, height: H }), context = canvas.getContext('2d');
   context.fillStyle = matchMedia('(prefers-color-scheme: dark)').matches ? 'rgba(200,210,225,.35)' : 'rgba(50,60,75,.28)';
   ground.forEach((p) => { const [x, y] = at(p); context.fillRect(x, y, 1.2, 1.2); });
-  const errors = used.map((view) => view.error_at_held_out ?? view.error_at_points ?? 0), worst = Math.max(0.01, ...errors);
+  const errors = used.map((view) => view.error_at_held_out ?? view.error_at_points ?? 0), worst = Math.max(1e-3, ...errors), best = Math.min(...errors, worst);
   const svg = make('svg', { viewBox: `0 0 ${W} ${H}`, style: 'position:absolute;inset:0', role: 'group', 'aria-label': 'Cameras from above' });
   const order = used.map((_, i) => i);
   order.forEach((i) => {
     const view = used[i], [x, y] = at(spots[i]), ahead = flat(view.axes[2]), turn = Math.atan2(ahead[1], ahead[0]), open = Math.atan(view.half[0]), r = 24;
     const corner = (a) => `${x + r * Math.cos(turn + a)} ${y + r * Math.sin(turn + a)}`;
     svg.append(make('g', { class: 'view', 'data-name': view.name, onclick: () => select(view.name) }, make('title', {}, `${view.name}: ${percent(errors[i])}`),
-      make('path', { d: `M${x} ${y}L${corner(-open)}A${r} ${r} 0 0 1 ${corner(open)}Z`, fill: css(viridis(errors[i] / worst)), 'fill-opacity': 0.75 })));
+      make('path', { d: `M${x} ${y}L${corner(-open)}A${r} ${r} 0 0 1 ${corner(open)}Z`, fill: css(viridis((errors[i] - best) / (worst - best || 1))), 'fill-opacity': 0.75 })));
   });
   onSelect((name) => { for (const group of svg.children) { group.classList.toggle('on', group.dataset.name === name); } svg.querySelector('.on') && svg.append(svg.querySelector('.on')); });
   const bar = make('div', { class: 'scale', style: `background:linear-gradient(to right, ${Array.from({ length: 9 }, (_, i) => css(viridis(i / 8))).join(',')})` });
   holder.append(make('div', { class: 'two' },
     make('figure', {}, make('div', { style: 'position:relative' }, canvas, svg)),
-    make('figure', {}, make('h3', {}, 'Median error at held-out points'), bar, make('div', { class: 'ends' }, make('span', {}, '0'), make('span', {}, percent(worst))),
+    make('figure', {}, make('h3', {}, 'Median error at held-out points'), bar, make('div', { class: 'ends' }, make('span', {}, percent(best)), make('span', {}, percent(worst))),
       make('p', { class: 'small soft' }, 'Each wedge is a camera: where it stands, where it looks and how wide. Up is the mean of what is up in the pictures. Grey: the cloud. Click one to see its maps.'))));
 }

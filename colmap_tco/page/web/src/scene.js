@@ -46,8 +46,11 @@ function fit() {
   const lists = [[], [], []];
   for (let i = 0; i < points.length; i += stride) for (let k = 0; k < 3; k++) lists[k].push(dot(axes[k], [points[i], points[i + 1], points[i + 2]]));
   if (!lists[0].length) lists.forEach((list, k) => list.push(...used.map((v) => dot(axes[k], v.centre)), 0));
-  const low = [], high = [];
+  const low = [], high = [], cameras = [0, 1, 2].map((k) => used.map((v) => dot(axes[k], v.centre)).sort((a, b) => a - b));
   lists.forEach((list) => { list.sort((a, b) => a - b); low.push(list[Math.floor(0.05 * list.length)]); high.push(list[Math.min(list.length - 1, Math.floor(0.95 * list.length))]); });
+  // The cameras too, unless they are so far away that the scene would be a speck.
+  const span = Math.max(...high.map((v, k) => v - low[k]));
+  cameras.forEach((list, k) => { if (list.length) { low[k] = Math.min(low[k], Math.max(list[0], low[k] - span)); high[k] = Math.max(high[k], Math.min(list[list.length - 1], high[k] + span)); } });
   return { middle: low.map((v, k) => (v + high[k]) / 2), extent: Math.max(...high.map((v, k) => v - low[k])) || 1 };
 }
 const { middle, extent } = fit();
@@ -129,6 +132,7 @@ export function startScene(canvas, note, form) {
     form.elements.turn.checked = false;
     look(display(view.centre), display(ahead));
   };
+  form.elements.size.value = Math.min(6, Math.max(1, Math.round(2 * 900 * Math.sqrt(1.4 / Math.max(1, data.cloud.count))) / 2));
   whole();
 
   const resize = () => {

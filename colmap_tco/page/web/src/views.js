@@ -59,8 +59,8 @@ function drawDots(canvas, points) {
 }
 
 function pointsOf(view) {
-  const xy = u16(view.points.xy), n = view.points.count;
-  return { count: n, x: Float32Array.from({ length: n }, (_, i) => xy[2 * i] / 65535), y: Float32Array.from({ length: n }, (_, i) => xy[2 * i + 1] / 65535), error: f32(view.points.error), held: u8(view.points.held) };
+  const xy = u16(view.errors.xy), n = view.errors.count;
+  return { count: n, x: Float32Array.from({ length: n }, (_, i) => xy[2 * i] / 65535), y: Float32Array.from({ length: n }, (_, i) => xy[2 * i + 1] / 65535), error: f32(view.errors.error), held: u8(view.errors.held) };
 }
 
 function histogram(points) {
@@ -86,7 +86,7 @@ async function show(holder, name) {
   const maps = view.maps, [depth, sure, normal, image] = await Promise.all([codesOf(maps.depth.codes, maps), codesOf(maps.confidence.codes, maps), pixels(maps.normal, maps.width, maps.height), pixels(maps.image, maps.width, maps.height)]);
   if (mine !== turn) return;
   const [near, far] = middle(depth, maps.depth), [doubt, trust] = middle(sure, maps.confidence);
-  const warmth = (z) => (far > near ? (1 / z - 1 / far) / (1 / near - 1 / far) : 0.5), sureness = (c) => (trust > doubt ? Math.log(c / doubt) / Math.log(trust / doubt) : 0.5);
+  const distance = (z) => (far > near ? Math.log(z / near) / Math.log(far / near) : 0.5), sureness = (c) => (trust > doubt ? Math.log(c / doubt) / Math.log(trust / doubt) : 0.5);
   const points = pointsOf(view), factor = Math.max(1, Math.round(900 / maps.width));
   const dots = make('canvas', { width: maps.width * factor, height: maps.height * factor });
   const redraw = () => drawDots(dots, points);
@@ -96,7 +96,7 @@ async function show(holder, name) {
   const figures = make('div', { class: 'maps' },
     figure('Picture, and error of the depth at COLMAP’s points', 'image', make('div', { class: 'over' }, canvasOf(maps, (i) => image.data.subarray(4 * i, 4 * i + 3)), dots), ...scale(signed, '−5 % too near', '+5 % too far'),
       make('div', { class: 'choices' }, box('used', 'points that were used'), box('held', 'held-out points (ringed)'))),
-    figure('Depth', 'depth', canvasOf(maps, (i) => (depth[i] ? warm(1 - warmth(level(depth[i], maps.depth))) : NONE)), ...scale((t) => warm(1 - warmth(near * (far / near) ** t)), digits(near), digits(far))),
+    figure('Depth', 'depth', canvasOf(maps, (i) => (depth[i] ? warm(distance(level(depth[i], maps.depth))) : NONE)), ...scale(warm, digits(near), digits(far))),
     figure('Confidence', 'confidence', canvasOf(maps, (i) => (sure[i] ? viridis(sureness(level(sure[i], maps.confidence))) : NONE)), ...scale(viridis, digits(doubt), digits(trust))),
     figure('Normals', 'normal', canvasOf(maps, (i) => { const c = [0, 1, 2].map((k) => (normal.data[4 * i + k] - 128) / 124); return c[0] || c[1] || c[2] ? [128 + 127 * c[0], 128 - 127 * c[1], 128 - 127 * c[2]] : NONE; }),
       make('p', { class: 'small soft' }, 'Red: right, green: up, blue: towards the camera.')),
