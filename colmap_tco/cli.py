@@ -89,6 +89,11 @@ COMMANDS: dict[str, Command] = {
         "colmap_tco.show:ReportConfig",
         "colmap_tco.show:show_report",
     ),
+    "view": Command(
+        "look at the cameras and clouds of a finished result in an interactive viewer (needs the extra view)",
+        "colmap_tco.viewer:ViewerConfig",
+        "colmap_tco.viewer:view",
+    ),
     "check": Command(
         "show what this machine has, what each network would need, and which one would run",
         "colmap_tco.check:CheckConfig",

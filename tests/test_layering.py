@@ -37,6 +37,8 @@ START_UP = (
     "memory",
     "attempts",
     "check",
+    "show",
+    "viewer",
 )
 """Modules of ``colmap_tco`` that the command line imports for their settings: nothing in LAZY at the top."""
 
