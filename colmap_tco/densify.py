@@ -181,6 +181,9 @@ def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified
     return Densified(folder, json.loads((folder / "report.json").read_text("utf-8")), fresh=True)
 
 
+SHOWN = ("loss", "held_out")
+"""Terms of a step that are shown while it runs."""
+
 HASHED = 200_000_000
 """Bytes below which a file of weights counts by its content, above by its size and time of change."""
 
@@ -266,7 +269,7 @@ def _predict(
         settings = (config.priors, config.tco, config.seed)
         return predict_chunk(
             (backbone, chosen.device), tracks, views, chunk, settings,
-            lambda terms: progress.advance(1, loss=terms["loss"]),
+            lambda terms: progress.advance(1, **{k: terms[k] for k in SHOWN if k in terms}),
         )  # fmt: skip
 
     for attempt in within_memory(todo, pairs.common, work, budget.views_now, lambda: release(chosen.device)):

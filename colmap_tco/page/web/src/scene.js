@@ -122,7 +122,7 @@ export function startScene(canvas, note, form) {
     camera.position.set(...position);
     orbit = new Orbit(camera, { element: canvas, target: new Vec3(...target), rotateSpeed: 0.25, panSpeed: 0.25, ease: 0.35, inertia: 0.7, minDistance: 0.02, maxDistance: 20 });
   };
-  const whole = () => { camera.perspective({ fov: 40 }); look([0.35, 0.45, 1.35], [0, 0, 0]); };
+  const whole = () => { camera.perspective({ fov: 40 }); look([0.3, 0.36, 1.15], [0, 0, 0]); };
   const through = () => {
     const view = used.find((v) => v.name === chosen);
     if (!view) return;
