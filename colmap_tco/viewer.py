@@ -121,7 +121,8 @@ class Viewer:
     @property
     def url(self) -> str:
         """Where the viewer is served on this machine."""
-        return f"http://localhost:{self.server.get_port()}"
+        host = self.server.get_host()
+        return f"http://{'localhost' if host == '0.0.0.0' else host}:{self.server.get_port()}"
 
     def stop(self) -> None:
         """End the server."""
@@ -236,6 +237,7 @@ def view(root: Path, config: ViewerConfig, progress: Progress) -> None:
     if config.max_points < 1:
         raise InputError(f"--max_points {config.max_points}: at least one point must be shown")
     viewer = Viewer(read_scene(finished(existing_root(root)), config.max_points), config)
+    progress.close()
     log.info("the result is shown at %s; Ctrl-C ends it", viewer.url)
     if config.open:
         webbrowser.open(viewer.url)
