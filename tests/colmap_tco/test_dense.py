@@ -24,7 +24,7 @@ def test_a_workspace_without_a_result_says_how_to_make_one(tmp_path: Path) -> No
 def test_thinning_keeps_the_lists_of_the_points_that_stay() -> None:
     lists = [[3], [], [0, 1, 2], [5, 4], [1]]
     start = np.concatenate([[0], np.cumsum([len(part) for part in lists])])
-    whole = Visibility(start, np.array(sum(lists, []), np.uint32))
+    whole = Visibility(start, np.array([image for part in lists for image in part], np.uint32))
     chosen = np.array([4, 2, 1, 3])
     few = thinned(whole, chosen)
     assert [few[i].tolist() for i in range(len(few))] == [lists[i] for i in chosen]

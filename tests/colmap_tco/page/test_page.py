@@ -268,9 +268,7 @@ def test_curves_map_and_table_are_there(opened: tuple[Page, list[str], list[str]
     page.wait_for_selector("#view[data-name='view_2.png']")
 
 
-def test_an_empty_cloud_has_a_page_that_says_why(
-    paths: DensePaths, browser: Browser, tmp_path: Path
-) -> None:
+def test_an_empty_cloud_has_a_page_that_says_why(paths: DensePaths, browser: Browser, tmp_path: Path) -> None:
     from colmap_tco.outputs import write_cloud
     from colmap_tco.ply import join
 
