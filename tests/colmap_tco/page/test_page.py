@@ -108,8 +108,10 @@ def test_errors_at_points_are_those_of_the_report(embedded: dict[str, Any]) -> N
         error, held = unpacked(view["errors"]["error"], "<f4"), unpacked(view["errors"]["held"], "u1") == 1
         assert held.sum() == view["points_held_out"]
         assert (~held).sum() == view["points"]
-        assert np.median(np.abs(error[held])) == pytest.approx(view["error_at_held_out"], rel=0.02)
-        assert np.median(np.abs(error[~held])) == pytest.approx(view["error_at_points"], rel=0.02)
+        for chosen, reported in ((held, "error_at_held_out"), (~held, "error_at_points")):
+            ordered = np.sort(np.abs(error[chosen]))
+            # torch's median, which the run has used, is the lower of the two in the middle.
+            assert ordered[(len(ordered) - 1) // 2] == pytest.approx(view[reported], rel=1e-3)
 
 
 def test_every_step_has_its_terms_and_the_error_at_held_out_points(embedded: dict[str, Any]) -> None:
@@ -191,9 +193,23 @@ def opened(browser: Browser, paths: DensePaths) -> Iterator[tuple[Page, list[str
     page.on("request", lambda request: asked.append(request.url))
     page.goto(paths.page.as_uri())
     page.wait_for_selector("#view figure[data-map=depth] canvas")
-    page.wait_for_function("+document.getElementById('scene').dataset.frames > 2")
+    wait_for_frames(page, 2)
     yield page, faults, asked
     page.close()
+
+
+def wait_for_frames(page: Page, more: int) -> None:
+    """Wait until the cloud was drawn so many times more; the page forbids the driver's own waiting."""
+
+    def count() -> int:
+        return int(page.get_attribute("#scene", "data-frames") or 0)
+
+    first = count()
+    for _ in range(600):
+        if count() >= first + more:
+            return
+        page.wait_for_timeout(100)
+    pytest.fail(f"the cloud was drawn {count() - first} times in a minute")
 
 
 def drawn(page: Page, selector: str) -> np.ndarray:
@@ -217,8 +233,7 @@ def test_the_cloud_is_drawn_in_many_colours(opened: tuple[Page, list[str], list[
     page.uncheck("#controls [name=dense]")
     page.uncheck("#controls [name=frusta]")
     page.uncheck("#controls [name=turn]")
-    frames = int(page.get_attribute("#scene", "data-frames") or 0)
-    page.wait_for_function(f"+document.getElementById('scene').dataset.frames > {frames + 2}")
+    wait_for_frames(page, 2)
     assert not drawn(page, "#scene")[..., 3].any()
     page.check("#controls [name=dense]")
     page.check("#controls [name=frusta]")
