@@ -85,7 +85,7 @@ def read_scene(paths: DensePaths, max_points: int) -> Scene:
     chosen = chosen_points(len(points), max_points)
     points, visibility = points[chosen], thinned(read_vis(paths.vis), chosen)
     _, xyz, rgb = _pycolmap.points(model)
-    origin = np.median(points if len(points) else xyz, axis=0)
+    origin = np.asarray(np.median(points if len(points) else xyz, axis=0), np.float64)
     return Scene(
         origin=origin,
         points=(points - origin).astype(np.float32),
