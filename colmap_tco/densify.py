@@ -27,6 +27,7 @@ from colmap_tco.fusion import EmptyCloudError, FusionConfig, fuse
 from colmap_tco.lock import locked
 from colmap_tco.mapping import MappingConfig, ensure_model
 from colmap_tco.memory import release
+from colmap_tco.page.write import write_page
 from colmap_tco.predict import ChunkResult, predict_chunk
 from colmap_tco.priors import PriorConfig, with_points
 from colmap_tco.progress import Progress
@@ -48,6 +49,9 @@ class DensifyConfig:
     overwrite: bool = knob(False, "replace an earlier result that was made with other settings")
     refine_cameras: bool = knob(
         False, "write the cameras as corrected by the optimisation instead of COLMAP's own"
+    )
+    report_page: bool = knob(
+        True, "write report.html too, the result as one page for the browser (a few megabytes)"
     )
     network: NetworkConfig = field(default_factory=NetworkConfig)
     tco: TCOConfig = field(default_factory=TCOConfig)
@@ -175,9 +179,14 @@ def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified
         "seconds": clock.seconds,
     }
     outputs.write_report(result.paths.report, figures)
+    if config.report_page:
+        write_page(result.paths, json.loads(result.paths.report.read_text("utf-8")))
     folder = result.publish().root
     return Densified(folder, json.loads((folder / "report.json").read_text("utf-8")), fresh=True)
 
+
+SHOWN = ("loss", "held_out")
+"""Terms of a step that are shown while it runs."""
 
 HASHED = 200_000_000
 """Bytes below which a file of weights counts by its content, above by its size and time of change."""
@@ -229,7 +238,7 @@ def _fingerprints(
 ) -> tuple[str, str]:
     """Two texts: one changes with everything that decides the result, one with what decides the maps."""
     kept = dataclasses.replace(
-        config, overwrite=False, fusion=dataclasses.replace(config.fusion, num_threads=-1)
+        config, overwrite=False, report_page=True, fusion=dataclasses.replace(config.fusion, num_threads=-1)
     )
     mapped = dataclasses.replace(kept, refine_cameras=False, fusion=FusionConfig())
     masks = [view.mask_path for view in views if view.mask_path is not None]
@@ -268,7 +277,7 @@ def _predict(
         settings = (config.priors, config.tco, config.seed)
         return predict_chunk(
             (backbone, chosen.device), tracks, views, chunk, settings,
-            lambda terms: progress.advance(1, loss=terms["loss"]),
+            lambda terms: progress.advance(1, **{k: terms[k] for k in SHOWN if k in terms}),
         )  # fmt: skip
 
     for attempt in within_memory(todo, pairs.common, work, budget.views_now, lambda: release(chosen.device)):

@@ -96,6 +96,7 @@ def predict_chunk(
         tco_config,
         seed,
         lambda _, terms: report(terms),
+        watched=[points.to(device) for points in priors.held_out],
     )
     prediction, moved = outcome.prediction.to("cpu"), outcome.cameras.to("cpu")
     assert priors.optimise.sparse is not None

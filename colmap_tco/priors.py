@@ -205,6 +205,12 @@ def _project(
     return seen, (int((~inside).sum()), int((inside & ~good).sum()))
 
 
+def usable_points(tracks: Tracks, view: View) -> tuple[Floats, Floats, Ints]:
+    """The points of a view that priors are made of: network pixels (N, 2), depths (N,), COLMAP's ids (N,)."""
+    seen, _ = _project(tracks, view, 1.0, (view.network.height, view.network.width))
+    return seen.xy, seen.depth, seen.track
+
+
 def _pose_error(tracks: Tracks, view: View) -> float:
     """Median reprojection error of a view over its focal length: radians."""
     error = tracks.images[view.image_id].error

@@ -110,10 +110,10 @@ class Progress:
             self._log()
 
     def _draw(self, bar: tqdm[Any], begins: bool) -> None:
-        if begins:
-            bar.set_description_str(self._names[-1], refresh=False)
-            if not self._shares:
-                bar.reset()
+        if begins and not self._shares:
+            bar.reset()
+        counted = f" {self._done}/{self._total}" if self._total > 1 else ""
+        bar.set_description_str(self._names[-1] + counted, refresh=False)
         bar.set_postfix(self._values, refresh=False)
         bar.update(self.fraction - bar.n)
         if begins:

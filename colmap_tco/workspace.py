@@ -83,6 +83,11 @@ class DensePaths:
         return self.root / "report.json"
 
     @property
+    def page(self) -> Path:
+        """The report as a page for the browser."""
+        return self.root / "report.html"
+
+    @property
     def manifest(self) -> Path:
         """What a later run needs to know to resume."""
         return self.root / "manifest.json"

@@ -59,6 +59,7 @@ def optimize(
     config: TCOConfig | None = None,
     seed: int = 0,
     report: Report | None = None,
+    watched: Sequence[SparseDepth] = (),
 ) -> Outcome:
     """Adapt ``backbone`` to the views and predict all of them; the network is left as it was.
 
@@ -77,6 +78,9 @@ def optimize(
         config: settings; ``steps = 0`` predicts without adapting.
         seed: of all randomness.
         report: called after every step with its number and its terms.
+        watched: points of each view that nothing is fitted to. The history then holds ``held_out``: the mean
+            over a step's sources of the median relative error at their points, as they are decoded in the
+            step, with a part of their input points hidden. It steers nothing.
 
     Raises:
         ValueError: a term has a weight and its prior is missing, or nothing may change.
@@ -101,6 +105,7 @@ def optimize(
     if config.steps == 0:
         return Outcome(first, first.cameras)
     run = _Run(backbone, views, priors, config, encoded, first, torch.Generator().manual_seed(seed))
+    run.watched = watched
     with run.adapters() as parameters:
         run.prepare(parameters)
         for step in range(config.steps):
@@ -137,6 +142,7 @@ class _Run:
         self.stagnation = Stagnation(len(views), patience) if patience else None
         self.history: list[dict[str, float]] = []
         self.rolled_back: list[int] = []
+        self.watched: Sequence[SparseDepth] = ()
         self.stopped = False
 
     def adapters(self) -> AbstractContextManager[list[torch.nn.Parameter]]:
@@ -179,7 +185,7 @@ class _Run:
             self.active, self.best_loss = tuple(weights), math.inf
         sources = self.sources.draw(self.config.sources)
         terms = self._evaluate(number, sources, weights)
-        hidden = terms.pop("hidden", None)
+        seen = {name: terms.pop(name) for name in ("hidden", "held_out") if name in terms}
         loss = torch.stack(
             [weights[name] * value for name, value in terms.items()] or [torch.zeros(())]
         ).sum()
@@ -194,8 +200,7 @@ class _Run:
             "loss": float(loss.detach()),
         }
         self._update(number, figures["loss"], bool(torch.isfinite(norm)))
-        if hidden is not None:
-            figures["hidden"] = float(hidden)
+        figures |= {name: float(value) for name, value in seen.items()}
         self.history.append(figures)
         return figures
 
@@ -222,7 +227,7 @@ class _Run:
             p.copy_(kept)
 
     def _evaluate(self, number: int, sources: list[int], weights: Mapping[str, float]) -> dict[str, Tensor]:
-        """Named terms of a step, means over its sources; and ``hidden``, the error at hidden points."""
+        """Named terms of a step, means over its sources; and errors that only tell, see :meth:`_watch`."""
         shown = {source: self._hide(source) for source in sources}
         count, overlap = self.config.targets, self.terms.overlap
         targets = {source: draw_targets(overlap, source, count, self.generator) for source in sources}
@@ -246,13 +251,16 @@ class _Run:
         return terms
 
     def _watch(self, source: int, shown: Tensor, prediction: Prediction) -> dict[str, Tensor]:
-        """The error at the points that were hidden, if it decides when to stop."""
-        if self.stagnation is None or bool(shown.all()):
-            return {}
+        """``held_out``: the error at watched points; ``hidden``: at hidden ones, if it tells when to stop."""
         depth = prediction.depth[prediction.views.index(source)].detach()
+        found = {}
+        if self.watched and len(self.watched[source]):
+            found["held_out"] = _errors(depth, self.watched[source]).abs().median()
+        if self.stagnation is None or bool(shown.all()):
+            return found
         hidden = sparse_depth(depth, self.terms.sparse[source][~shown])
         self.stopped |= self.stagnation.add(source, float(hidden))
-        return {"hidden": hidden}
+        return {**found, "hidden": hidden}
 
     def _hide(self, source: int) -> Tensor:
         """Which points of a view (N,) the network is shown in this step."""
@@ -339,9 +347,11 @@ def errors_at_points(prediction: Prediction, points: Sequence[SparseDepth]) -> l
 
     The depth at a point is that of the pixel it falls into: what a user reads off the map.
     """
-    out = []
-    for depth, sparse in zip(prediction.depth, points, strict=True):
-        h, w = depth.shape
-        x, y = sparse.xy.long().unbind(-1)
-        out.append(depth[y.clamp(0, h - 1), x.clamp(0, w - 1)] / sparse.depth - 1)
-    return out
+    return [_errors(depth, sparse) for depth, sparse in zip(prediction.depth, points, strict=True)]
+
+
+def _errors(depth: Tensor, sparse: SparseDepth) -> Tensor:
+    """Relative errors (N,) of one depth map (H, W) at points."""
+    h, w = depth.shape
+    x, y = sparse.xy.long().unbind(-1)
+    return depth[y.clamp(0, h - 1), x.clamp(0, w - 1)] / sparse.depth - 1

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from colmap_tco import cli
+from colmap_tco.commands import COMMANDS
 from colmap_tco.flags import settings
 from colmap_tco.progress import Progress, clock, remaining
 
@@ -24,7 +25,8 @@ HEAVY = ("torch", "pycolmap", "open3d", "numba", "cv2", "kornia", "scipy")
 NOT_FOR_THE_LIST = (*HEAVY, "numpy", "PIL", "tqdm")
 PROGRAM = """
 import sys
-from colmap_tco.cli import Command, main
+from colmap_tco.cli import main
+from colmap_tco.commands import Command
 table = {"example": Command("run the example", "tests.cli_examples:ExampleConfig", "tests.cli_examples:run")}
 sys.exit(main(commands=table))
 """
@@ -188,24 +190,24 @@ def test_the_list_of_commands_imports_nothing_heavy() -> None:
     assert imported_by_help(of=NOT_FOR_THE_LIST) == []
 
 
-@pytest.mark.parametrize("name", cli.COMMANDS)
+@pytest.mark.parametrize("name", COMMANDS)
 def test_the_help_of_a_command_imports_nothing_heavy(name: str) -> None:
     if not _is_there(name):
         pytest.skip(f"the module of {name} is not there yet")
     assert imported_by_help(name, of=HEAVY) == []
 
 
-@pytest.mark.parametrize("name", cli.COMMANDS)
+@pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_in_the_table_has_a_configuration_and_a_function(name: str) -> None:
     if not _is_there(name):
         pytest.skip(f"the module of {name} is not there yet")
-    command = cli.COMMANDS[name]
+    command = COMMANDS[name]
     assert settings(cli._load(command.config))
     assert callable(cli._load(command.function))
 
 
 def _is_there(name: str) -> bool:
-    return importlib.util.find_spec(cli.COMMANDS[name].config.partition(":")[0]) is not None
+    return importlib.util.find_spec(COMMANDS[name].config.partition(":")[0]) is not None
 
 
 def test_version_is_printed() -> None:

@@ -37,9 +37,12 @@ START_UP = (
     "memory",
     "attempts",
     "check",
+    "commands",
     "export/command",
     "export/dense",
     "mesh",
+    "show",
+    "viewer",
 )
 """Modules of ``colmap_tco`` that the command line imports for their settings: nothing in LAZY at the top."""
 

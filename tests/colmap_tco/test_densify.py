@@ -118,7 +118,7 @@ def test_the_result_is_complete(done: Done) -> None:
     expected = {f"images/{name}" for name in names}
     for kind in ("depth", "normal", "confidence"):
         expected |= {f"stereo/{kind}_maps/{name}.geometric.bin" for name in names}
-    expected |= {"fused.ply", "fused.ply.vis", "report.json", "manifest.json"}
+    expected |= {"fused.ply", "fused.ply.vis", "report.json", "report.html", "manifest.json"}
     expected |= {"stereo/fusion.cfg", "stereo/patch-match.cfg"}
     found = {path.relative_to(done.dense).as_posix() for path in done.dense.rglob("*") if path.is_file()}
     model = {f"sparse/{kind}.bin" for kind in ("cameras", "images", "points3D")}

@@ -467,3 +467,24 @@ def test_errors_at_points_are_those_of_the_pixels_they_fall_into() -> None:
 def test_settings_out_of_range_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=r"steps|point_dropout"):
         TCOConfig(**wrong)  # type: ignore[arg-type]
+
+
+def test_watched_points_are_measured_in_every_step_and_steer_nothing(scene: Scene) -> None:
+    """Where nothing learns and nothing is hidden, each step sees the error of the plain prediction."""
+    views, priors, _ = scene
+    assert priors.sparse is not None
+    watched = [points[torch.arange(len(points)) % 3 == view % 2] for view, points in enumerate(priors.sparse)]
+    watched[2] = watched[2][torch.zeros(len(watched[2]), dtype=torch.bool)]
+    still = replace(SMALL, steps=2 * V, rate=0.0, camera_rate=0.0, point_dropout=0.0)
+    small = Small()
+    outcome = optimize(small, views, priors, still, watched=watched)
+    errors = errors_at_points(outcome.prediction, watched)
+    for (source,), terms in zip(small.decoded, outcome.history, strict=True):
+        if source == 2:
+            assert "held_out" not in terms
+        else:
+            assert terms["held_out"] == pytest.approx(float(errors[source].abs().median()), rel=1e-4)
+    with_points = optimize(Small(), views, priors, SMALL, watched=watched)
+    without = optimize(Small(), views, priors, SMALL)
+    assert torch.equal(depth_of(with_points), depth_of(without))
+    assert [t["loss"] for t in with_points.history] == [t["loss"] for t in without.history]
