@@ -35,6 +35,14 @@ ESTIMATES: dict[tuple[str, str, str], tuple[float, float, float]] = {
     ("pi3", "float32", "optimised"): (4.2e9, 13000.0, 10000.0),
     ("pi3", "bfloat16", "forward"): (2.3e9, 2000.0, 5000.0),
     ("pi3", "bfloat16", "optimised"): (2.3e9, 7800.0, 10000.0),
+    ("da3", "float32", "forward"): (0.9e9, 2000.0, 5000.0),
+    ("da3", "float32", "optimised"): (0.9e9, 2900.0, 10000.0),
+    ("da3", "bfloat16", "forward"): (0.8e9, 2000.0, 5000.0),
+    ("da3", "bfloat16", "optimised"): (0.8e9, 2000.0, 10000.0),
+    ("da3-small", "float32", "forward"): (0.5e9, 1000.0, 5000.0),
+    ("da3-small", "float32", "optimised"): (0.5e9, 1450.0, 10000.0),
+    ("da3-small", "bfloat16", "forward"): (0.5e9, 1000.0, 5000.0),
+    ("da3-small", "bfloat16", "optimised"): (0.5e9, 1000.0, 10000.0),
 }
 """Until ``benchmarks/memory.py`` was run for a network: its parameters, of those of the blocks half in
 bfloat16, and the process; 360 bytes a pixel that each adapted block keeps in float32 (48 blocks for vggt, 36
