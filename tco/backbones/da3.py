@@ -1,8 +1,9 @@
 """Depth Anything 3 (Lin et al. 2025, arXiv 2511.10647) as a backbone, around its authors' package.
 
 The package declares requirements that the network does not import and that clash with those here (numpy < 2,
-xformers, …), so it is installed without them: :data:`INSTALL`. Its modules are called here one by one. Its own entry point runs under ``inference_mode``, and its forward pass neither keeps what comes before the
-adapted layers nor decodes a part of the views:
+xformers, …), so it is installed without them: :data:`INSTALL`. Its modules are called here one by one: its own
+entry point runs under ``inference_mode``, and its forward pass neither keeps what comes before the adapted
+layers nor decodes a part of the views.
 
 - ``encode`` runs the first blocks, which see one view each, and what takes the place of the class token
   from then on: an encoding of the camera where the priors know it (normalised as the package's interface does
@@ -284,7 +285,7 @@ def normalized_cameras(world_from_cam: Tensor) -> Tensor:
 
 
 def _reference(tokens: Tensor) -> int:
-    """The view that the package takes for its reference, from tokens (1, V, N, C) before the last frozen block."""
+    """The package's reference view, from tokens (1, V, N, C) before the last block that is not adapted."""
     from depth_anything_3.model.reference_view_selector import select_reference_view
     from depth_anything_3.utils.constants import THRESH_FOR_REF_SELECTION
 
