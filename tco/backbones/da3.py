@@ -1,7 +1,7 @@
 """Depth Anything 3 (Lin et al. 2025, arXiv 2511.10647) as a backbone, around its authors' package.
 
 The package declares requirements that the network does not import and that clash with those here (numpy < 2,
-xformers, …), so it is installed without them: :data:`INSTALL`. Its modules are called here one by one: its own
+xformers, …), so it is installed without them: :data:`INSTALL`. Its modules are called one by one: its own
 entry point runs under ``inference_mode``, and its forward pass neither keeps what comes before the adapted
 layers nor decodes a part of the views.
 
