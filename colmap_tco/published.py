@@ -2,7 +2,7 @@
 
 The facts on checkpoints are those of their publishers: VGGT's README of 29 July 2025 and its model cards
 (``facebook/VGGT-1B``: CC BY-NC 4.0; ``facebook/VGGT-1B-Commercial``: VGGT License v1, on request), and the
-table of licences in π³'s README. Depth Anything 3: the table in its README, which gives Apache 2.0 for DA3-BASE
+table of licences in π³'s README. Depth Anything 3: the table in its README, with Apache 2.0 for DA3-BASE
 and DA3-SMALL, and CC BY-NC 4.0 for the larger networks for many views; those are left out, as the hub's card
 of DA3-LARGE-1.1 is said to contradict that (ByteDance-Seed/Depth-Anything-3, issue 259). Revisions
 are pinned, so that size and SHA-256 are those of one file for ever.
