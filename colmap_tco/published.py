@@ -101,7 +101,7 @@ _DA3_LICENCE: dict[str, Any] = {
     "licence": "Apache-2.0",
     "terms": "commercial use allowed",
     "commercial": True,
-    "licence_url": "https://github.com/ByteDance-Seed/Depth-Anything-3#%EF%B8%8F-model-cards",
+    "licence_url": "https://www.apache.org/licenses/LICENSE-2.0",
 }
 
 _VGGT_LICENCE = "https://github.com/facebookresearch/vggt/blob/main/LICENSE.txt"
