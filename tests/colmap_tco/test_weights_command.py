@@ -21,7 +21,7 @@ from safetensors.torch import save
 from colmap_tco.errors import InputError, MissingError
 from colmap_tco.progress import Progress
 from colmap_tco.published import NETWORKS, PUBLISHED, Checkpoint
-from colmap_tco.weights import WeightsConfig, require, verify, weights
+from colmap_tco.weights import WeightsConfig, require, table, verify, weights
 
 ROOT = Path(__file__).resolve().parents[2]
 VGGT_NAMES = ("aggregator.frame_blocks.0.a", "aggregator.global_blocks.0.a", "depth_head.a")
@@ -235,8 +235,14 @@ def test_the_list_names_repositories_sizes_and_licences(tmp_path: Path) -> None:
         assert f"colmap-tco weights fetch {name}" in line
         assert f"{name}: {checkpoint.licence}, {checkpoint.terms}" in done.stdout
     assert "5.0 GB" in lines["vggt"] and "3.8 GB" in lines["pi3"]
-    for name, network in NETWORKS.items():
-        assert (f"{name}: {network.install}" in done.stdout) == bool(network.missing())
+
+
+def test_the_list_tells_how_to_install_what_a_network_runs_from(monkeypatch: pytest.MonkeyPatch) -> None:
+    da3 = NETWORKS["da3"]
+    line = f"da3: pip install 'colmap-tco[da3]' && {da3.install.partition(' && ')[2]}"
+    for modules, told in (((), False), (("no_such_module",), True)):
+        monkeypatch.setitem(NETWORKS, "da3", replace(da3, modules=modules))
+        assert (line in table().splitlines()) == told
 
 
 @pytest.mark.parametrize(
