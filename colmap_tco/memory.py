@@ -46,7 +46,7 @@ ESTIMATES: dict[tuple[str, str, str], tuple[float, float, float]] = {
 }
 """Until ``benchmarks/memory.py`` was run for a network: its parameters, of those of the blocks half in
 bfloat16, and the process; 360 bytes a pixel that each adapted block keeps in float32 (48 blocks for vggt, 36
-for pi3), six tenths of it in bfloat16; the rest are guesses on the safe side. For da3 (8 adapted blocks, of 768
+for pi3), six tenths of it in bfloat16; the rest are guesses on the safe side. For da3 (8 adapted blocks, 768
 channels; da3-small 384) they lie 1 to 18 % above the peaks of three views of 168×126 in float32 on a CPU."""
 
 
