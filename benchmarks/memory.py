@@ -30,6 +30,8 @@ SIZES = {
     "sweep": ((4, 128, 96), (10, 128, 96), (4, 256, 192), (12, 256, 192), (4, 512, 384), (9, 512, 384)),
     "vggt": ((2, 84, 56), (5, 84, 56), (2, 168, 126), (4, 168, 126)),
     "pi3": ((2, 84, 56), (5, 84, 56), (2, 168, 126), (4, 168, 126)),
+    "da3": ((2, 84, 56), (5, 84, 56), (2, 168, 126), (4, 168, 126)),
+    "da3-small": ((2, 84, 56), (5, 84, 56), (2, 168, 126), (4, 168, 126)),
 }
 """(views, width, height) that are measured by default."""
 MODES = {"forward": 0, "optimised": 1}
@@ -174,7 +176,7 @@ def made(network: str, device: Any, dtype: Any) -> Any:
     """A network of the published size, with weights that do no harm."""
     import torch
 
-    from tco.backbones import pi3, vggt
+    from tco.backbones import da3, pi3, vggt
     from tco.backbones.weights import load_sweep
 
     if network == "sweep":
@@ -182,6 +184,8 @@ def made(network: str, device: Any, dtype: Any) -> Any:
     build, config, wrap = {
         "vggt": (vggt.VGGTNetwork, vggt.VGGTConfig.vggt_1b(), vggt.VGGT),
         "pi3": (pi3.Pi3Network, pi3.Pi3Config.large(), pi3.Pi3),
+        "da3": (da3.DA3Network, da3.DA3Config.base(), da3.DA3),
+        "da3-small": (da3.DA3Network, da3.DA3Config.small(), da3.DA3),
     }[network]
     with torch.device("meta"):
         empty = build(config)

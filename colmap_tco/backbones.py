@@ -38,9 +38,10 @@ class NetworkConfig:
 
     backbone: str = knob(
         "auto",
-        "network that predicts the depths. auto: vggt or pi3 where there is a CUDA device for it and its "
-        "weights were fetched (colmap-tco weights), else sweep, which is in the package. vggt and pi3 adapt "
-        "qkv, proj, fc1, fc2 at a rate of 5e-4 where lora_targets and rate are left alone",
+        "network that predicts the depths. auto: vggt, pi3 or da3 where there is a CUDA device and its "
+        "weights were fetched (colmap-tco weights), else sweep, which is in the package. All but sweep adapt "
+        "qkv, proj, fc1, fc2 at a rate of 5e-4 where lora_targets and rate are left alone. da3 and da3-small "
+        "need the package depth-anything-3 and take the cameras as input",
         choices=("auto", *NETWORKS),
     )
     weights: str = knob(
@@ -138,7 +139,8 @@ def select(config: NetworkConfig) -> Selected:
     """The network that a configuration means, with its weights found and looked at, but not read.
 
     Raises:
-        MissingError: no such device, or weights that are missing, damaged or of another network.
+        MissingError: no such device, a package that the network needs is not installed, or weights that are
+            missing, damaged or of another network.
     """
     device = choose_device(config.device)
     file = Path(config.weights).expanduser() if config.weights else None
@@ -152,6 +154,11 @@ def select(config: NetworkConfig) -> Selected:
         network, reason = _best(device)
         path = located(network)
     require(path, network)
+    if network.missing():
+        raise MissingError(
+            f"--backbone {network.name} runs from packages that are not installed "
+            f"({', '.join(network.missing())}): {network.install}"
+        )
     return Selected(network, path, device, reason)
 
 
@@ -176,10 +183,14 @@ def _owner(path: Path) -> Network:
 
 def _best(device: torch.device) -> tuple[Network, str]:
     """The network for ``auto``: a published one if weights, licence, device and memory allow, else sweep."""
-    ready = [name for name in PUBLISHED if cached(PUBLISHED[name][1]) and accepted(NETWORKS[name])]
+    fetched = [name for name in PUBLISHED if cached(PUBLISHED[name][1]) and accepted(NETWORKS[name])]
+    ready = [name for name in fetched if not NETWORKS[name].missing()]
     sweep = NETWORKS["sweep"]
     if not ready:
-        return sweep, f"auto: no weights of {' or '.join(PUBLISHED)} were fetched with their licence accepted"
+        return sweep, (
+            f"auto: no weights of {' or '.join(PUBLISHED)} were fetched with their licence accepted, or what "
+            "they run from is not installed"
+        )
     if device.type != "cuda":
         return sweep, (
             f"auto: {' and '.join(ready)} could run, but take long without a CUDA device; "

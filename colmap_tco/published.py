@@ -2,14 +2,17 @@
 
 The facts on checkpoints are those of their publishers: VGGT's README of 29 July 2025 and its model cards
 (``facebook/VGGT-1B``: CC BY-NC 4.0; ``facebook/VGGT-1B-Commercial``: VGGT License v1, on request), and the
-table of licences in π³'s README. Revisions are pinned, so that size and SHA-256 are those of one file for
-ever.
+table of licences in π³'s README. Depth Anything 3: the table in its README, with Apache 2.0 for DA3-BASE
+and DA3-SMALL, and CC BY-NC 4.0 for the larger networks for many views; those are left out, as the hub's card
+of DA3-LARGE-1.1 is said to contradict that (ByteDance-Seed/Depth-Anything-3, issue 259). Revisions
+are pinned, so that size and SHA-256 are those of one file for ever.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from typing import Any
 
 
@@ -62,6 +65,8 @@ class Network:
         stride: sides of images are multiples of this.
         tco: settings of :class:`tco.options.TCOConfig` that suit this network, for those which the user
             left at their defaults.
+        modules: what it imports that is not among this package's requirements.
+        install: the command that brings them.
     """
 
     name: str
@@ -72,10 +77,32 @@ class Network:
     image_size: int
     stride: int
     tco: Mapping[str, Any] = field(default_factory=dict)
+    modules: tuple[str, ...] = ()
+    install: str = ""
+
+    def missing(self) -> tuple[str, ...]:
+        """Those of ``modules`` that are not installed; nothing is imported."""
+        return tuple(module for module in self.modules if find_spec(module) is None)
 
 
 _PAPER = {"lora_targets": ("qkv", "proj", "fc1", "fc2"), "rate": 5e-4}
 """Layers with adapters and learning rate of the published code (arXiv 2604.03878)."""
+
+_DA3: dict[str, Any] = {
+    "loader": "tco.backbones.da3:load",
+    "kind": "da3",
+    "image_size": 504,
+    "stride": 14,
+    "tco": _PAPER,
+    "modules": ("depth_anything_3", "addict", "einops", "omegaconf"),
+    "install": "pip install 'colmap-tco[da3]' && pip install --no-deps depth-anything-3==0.1.1",
+}
+_DA3_LICENCE: dict[str, Any] = {
+    "licence": "Apache-2.0",
+    "terms": "commercial use allowed",
+    "commercial": True,
+    "licence_url": "https://www.apache.org/licenses/LICENSE-2.0",
+}
 
 _VGGT_LICENCE = "https://github.com/facebookresearch/vggt/blob/main/LICENSE.txt"
 
@@ -151,6 +178,32 @@ NETWORKS: dict[str, Network] = {
             image_size=518,
             stride=14,
             tco=_PAPER,
+        ),
+        Network(
+            name="da3",
+            title="Depth Anything 3, base (Lin et al. 2025)",
+            checkpoint=Checkpoint(
+                repository="depth-anything/DA3-BASE",
+                revision="f4a6c9b3c95e41c82048423d3493a81ec3fa810e",
+                file="model.safetensors",
+                size=541_518_028,
+                sha256="e01067dc1659613083d9145a9a2547ccdbe6ccbbf83c4fe7b3e8a4e2bdae78b5",
+                **_DA3_LICENCE,
+            ),
+            **_DA3,
+        ),
+        Network(
+            name="da3-small",
+            title="Depth Anything 3, small (Lin et al. 2025)",
+            checkpoint=Checkpoint(
+                repository="depth-anything/DA3-SMALL",
+                revision="e08cab65ca0ec38e7826075418411ab90cab4da3",
+                file="model.safetensors",
+                size=137_248_940,
+                sha256="364492e38a3a06d221ac75da7f6621ada3f2361cd24fde11ba79091e9f40efcf",
+                **_DA3_LICENCE,
+            ),
+            **_DA3,
         ),
     )
 }

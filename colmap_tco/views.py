@@ -45,7 +45,7 @@ class ViewConfig:
     max_image_size: int = knob(
         0,
         "longer side of the images that the network sees, pixels; memory and time grow with its square. 0: "
-        "what the network was trained with, 256 for sweep, 518 for vggt and pi3",
+        "what the network was trained with, 256 for sweep, 518 for vggt and pi3, 504 for da3",
     )
     mask_path: str = knob(
         "",

@@ -92,7 +92,8 @@ def table() -> str:
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
     terms = [f"{name}: {c.licence}, {c.terms}; {c.licence_url}" for name, (_, c) in PUBLISHED.items()]
-    return "\n".join([*lines, "", *terms])
+    beside = [f"{n.name}: {n.install}" for n in NETWORKS.values() if n.missing()]
+    return "\n".join([*lines, "", *terms, *beside])
 
 
 def gigabytes(size: float) -> str:

@@ -22,6 +22,8 @@ tomllib = pytest.importorskip("tomllib", reason="pyproject.toml is read with the
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("tco", "colmap_tco")
 WEIGHTS = "tco/backbones/data/probe.safetensors"
+# Installed beside this package on purpose, as its own requirements clash; see the extra da3.
+BESIDE = {"depth_anything_3"}
 # Distributions whose modules have another name.
 MODULES = {"cv2": "opencv-python-headless", "PIL": "pillow", "skimage": "scikit-image"}
 
@@ -99,13 +101,13 @@ def test_every_third_party_import_is_declared() -> None:
     used = {
         name for package in PACKAGES for path in (ROOT / package).rglob("*.py") for name in imported(path)
     }
-    foreign = used - set(sys.stdlib_module_names) - set(PACKAGES)
+    foreign = used - set(sys.stdlib_module_names) - set(PACKAGES) - BESIDE
     assert {canonicalize_name(MODULES.get(name, name)) for name in foreign} <= declared
 
 
 def test_the_pins_lie_in_the_declared_ranges() -> None:
     versions = pins()
-    for requirement in requirements("hub", "las", "dev"):
+    for requirement in requirements("hub", "las", "da3", "dev"):
         name = canonicalize_name(requirement.name)
         assert name in versions, f"constraints.txt does not pin {name}"
         assert versions[name] in requirement.specifier, f"{name} {versions[name]} is outside its range"
@@ -113,7 +115,7 @@ def test_the_pins_lie_in_the_declared_ranges() -> None:
 
 def test_every_dependency_of_a_dependency_is_pinned() -> None:
     """A fresh machine must get the same versions tomorrow: nothing is left for pip to choose."""
-    versions, seen, left = pins(), set(), requirements("hub", "las", "dev")
+    versions, seen, left = pins(), set(), requirements("hub", "las", "da3", "dev")
     while left:
         requirement = left.pop()
         name = canonicalize_name(requirement.name)
@@ -160,7 +162,7 @@ def ci(checkout: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     # make hands its own flags down, which would change what is tested under `make test`
     inherited = {name: value for name, value in os.environ.items() if name not in ("MAKEFLAGS", "MFLAGS")}
     if "PATH" not in environment:  # nothing is installed while tests run
-        environment["PATH"] = programs(checkout / "programs", colmap="true")
+        environment["PATH"] = programs(checkout / "programs", colmap="true", chromium="true")
     command = ["bash", str(checkout / ".ci/run")]
     return subprocess.run(
         command, env={**inherited, **environment}, cwd="/", capture_output=True, text=True, check=False
@@ -196,20 +198,23 @@ def test_ci_stops_at_the_first_failure(checkout: Path, broken: str | None, ran: 
 
 
 @pytest.mark.parametrize("works", [True, False])
-def test_ci_installs_colmap_or_says_that_it_cannot(checkout: Path, works: bool) -> None:
+def test_ci_installs_programs_or_says_that_it_cannot(checkout: Path, works: bool) -> None:
     script = f"echo apt-get $* >> {checkout}/calls\n" + ("exit 0" if works else "exit 100")
     path = programs(checkout / "programs", apt_get=script)
     done = ci(checkout, PATH=path, MAKEFLAGS="n")
     assert done.returncode == 0, done.stderr
     calls = (checkout / "calls").read_text().splitlines()
-    assert calls[0] == "apt-get update"
-    assert (calls[1:] == ["apt-get install -y --no-install-recommends colmap"]) is works
-    assert ("colmap could not be installed" in done.stderr) is not works
+    install = "apt-get install -y -qq --no-install-recommends"
+    wanted = [["apt-get update -qq", f"{install} {name}"] for name in ("colmap", "chromium")]
+    assert calls == [call for pair in wanted for call in (pair if works else pair[:1])]
+    for name in ("colmap", "chromium"):
+        assert (f"{name} could not be installed" in done.stderr) is not works
     assert "-m pytest" in done.stdout
 
 
 def test_ci_does_not_install_what_is_there(checkout: Path) -> None:
     script = f"echo called >> {checkout}/calls"
-    done = ci(checkout, PATH=programs(checkout / "programs", apt_get=script, colmap="true"), MAKEFLAGS="n")
+    path = programs(checkout / "programs", apt_get=script, colmap="true", chromium="true")
+    done = ci(checkout, PATH=path, MAKEFLAGS="n")
     assert done.returncode == 0, done.stderr
     assert not (checkout / "calls").exists()

@@ -26,7 +26,7 @@ CONFIG = "config"
 def load_network(
     path: Path,
     build: Callable[[_Config], _Network],
-    published: _Config,
+    published: _Config | Callable[[Mapping[str, Tensor]], _Config],
     skipped: tuple[str, ...] = (),
 ) -> _Network:
     """A network on the CPU with the tensors of a file, which are not copied.
@@ -34,25 +34,42 @@ def load_network(
     Args:
         path: a file that :func:`read` reads.
         build: the network's class; called with sizes, on the meta device, so that nothing is initialised.
-        published: the sizes, unless the file's metadata has others.
+        published: the sizes, unless the file's metadata has others; where checkpoints of several sizes are
+            published, a function that tells them from the tensors.
         skipped: prefixes of names that the file may hold and that the network has no use for.
 
     Raises:
         WeightsError: see :func:`read`; names or shapes differ from those of the network.
     """
     tensors, info = read(path)
-    config = _sizes(info[CONFIG], type(published), path) if CONFIG in info else published
+    config: _Config = published(tensors) if callable(published) else published
+    if CONFIG in info:
+        config = _sizes(info[CONFIG], type(config), path)
     with torch.device("meta"):
         network = build(config)
     used = {name: tensor for name, tensor in tensors.items() if not name.startswith(skipped or ("\0",))}
+    for names in tied(network):
+        stored = [name for name in names if name in used]
+        used.update({name: used[stored[0]] for name in names if len(stored) == 1})
     check(network, used, path)
     network.load_state_dict(used, assign=True)
     return network
 
 
+def tied(network: nn.Module) -> list[list[str]]:
+    """Names of parameters that are one and the same; safetensors files hold them once, under one name."""
+    names: dict[int, list[str]] = {}
+    for name, parameter in network.named_parameters(remove_duplicate=False):
+        names.setdefault(id(parameter), []).append(name)
+    return [same for same in names.values() if len(same) > 1]
+
+
 def save(path: Path, network: nn.Module, config: Any) -> None:
-    """Write a network as safetensors, with its sizes (a dataclass) in the metadata."""
+    """Write a network as safetensors, with its sizes (a dataclass) in the metadata; tied names once."""
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in network.state_dict().items()}
+    for names in tied(network):
+        for name in names[1:]:
+            del tensors[name]
     save_file(tensors, path, {"format": "pt", CONFIG: json.dumps(dataclasses.asdict(config))})
 
 
@@ -69,7 +86,7 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     if head.startswith(b"PK\x03\x04"):
         return _read_torch(path), {}
     foreign = _kind(head)
-    if foreign:
+    if foreign and head[8:9] != b"{":  # the length that safetensors begins with can be any bytes
         raise WeightsError(
             f"{path}: this is {foreign}, not weights in the format of safetensors or torch.save; "
             "fetch the file itself"

@@ -15,6 +15,7 @@ from tco.backbones.weights import WeightsError
 SIGNATURES: dict[str, tuple[str, ...]] = {
     "vggt": ("aggregator.frame_blocks.", "aggregator.global_blocks.", "depth_head."),
     "pi3": ("encoder.", "decoder.", "point_decoder.", "camera_decoder."),
+    "da3": ("model.backbone.pretrained.", "model.head.", "model.cam_enc.", "model.cam_dec."),
 }
 """Network → beginnings of names that all its checkpoints have, and no other network's have together."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,16 +15,24 @@ from colmap_tco.published import NETWORKS, PUBLISHED
 from colmap_tco.weights import _note_accepted, cached
 from tco.backbones.base import Backbone
 from tco.backbones.checkpoints import save
+from tco.backbones.da3 import INSTALL, DA3Config, DA3Network
 from tco.backbones.dinov2 import ViTConfig
 from tco.backbones.pi3 import Pi3Config, Pi3Network
 from tco.backbones.vggt import VGGTConfig, VGGTNetwork
 from tco.backbones.weights import EMBEDDED
 from tco.options import TCOConfig
+from tests.tco.published import TINY_DA3
 
 VIT = ViTConfig(channels=48, depth=1, heads=2)
+CLASSES: dict[type, type[torch.nn.Module]] = {
+    VGGTConfig: VGGTNetwork,
+    Pi3Config: Pi3Network,
+    DA3Config: DA3Network,
+}
 TINY = {
     "vggt": VGGTConfig(VIT, 48, 4, 2, 4, 1, 2, 8, (8, 8, 8, 8), (0, 1, 2, 3)),
     "pi3": Pi3Config(ViTConfig(48, 1, 2, mask_token=False), 48, 4, 2, 5, 48, 1, 2, 32),
+    "da3": TINY_DA3,
 }
 
 
@@ -37,10 +46,12 @@ def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def written(path: Path, kind: str) -> Path:
-    """A small network of a kind, as a checkpoint."""
+    """A small network of a kind, as a checkpoint; skips where a package that it needs is missing."""
+    if missing := NETWORKS[kind].missing():
+        pytest.skip(f"not installed: {', '.join(missing)}")
     torch.manual_seed(0)
     config = TINY[kind]
-    save(path, VGGTNetwork(config) if isinstance(config, VGGTConfig) else Pi3Network(config), config)
+    save(path, CLASSES[type(config)](config), config)
     return path
 
 
@@ -73,7 +84,7 @@ def test_weights_that_are_missing_or_foreign_are_an_error(tmp_path: Path, backbo
 def test_the_network_in_the_package_needs_nothing_and_is_frozen() -> None:
     chosen = select(NetworkConfig(device="cpu"))
     assert chosen.network.name == "sweep" and chosen.weights == EMBEDDED
-    assert "no weights of vggt or vggt-commercial or pi3 were fetched with their lic" in chosen.reason
+    assert "no weights of vggt or vggt-commercial or pi3 or da3 or da3-small were fetched" in chosen.reason
     network = load(chosen)
     assert isinstance(network, torch.nn.Module) and not network.training
     assert not any(p.requires_grad for p in network.parameters())
@@ -124,7 +135,23 @@ def test_a_file_of_weights_runs_the_network_that_it_is_of(tmp_path: Path, kind: 
     network = load(chosen)
     assert isinstance(network, Backbone)
     assert (network.stride, network.uses_cameras) == (chosen.network.stride, False)
-    assert str(chosen.describe()["licence"]).startswith("CC BY-NC 4.0: no commercial use")
+    licence = "Apache-2.0: commercial use allowed" if kind == "da3" else "CC BY-NC 4.0: no commercial use"
+    assert str(chosen.describe()["licence"]).startswith(licence)
+
+
+@pytest.mark.parametrize("name", ["da3", "da3-small"])
+def test_a_package_that_is_not_installed_is_told_with_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    path = written(tmp_path / "mine.safetensors", "da3")
+    lacking = replace(NETWORKS[name], modules=("depth_anything_3", "no_such_module"))
+    monkeypatch.setitem(NETWORKS, name, lacking)
+    with pytest.raises(MissingError, match=r"not installed \(no_such_module\): pip install") as told:
+        select(NetworkConfig(backbone=name, weights=str(path), device="cpu"))
+    assert str(told.value).endswith(INSTALL)
+    fetched(tmp_path, name)
+    _note_accepted(*PUBLISHED[name])
+    assert _best(torch.device("cpu"))[1].startswith("auto: no weights of")
 
 
 def test_weights_of_another_network_are_refused_before_they_are_read(tmp_path: Path) -> None:
@@ -142,6 +169,8 @@ def test_the_registry_agrees_with_the_networks(tmp_path: Path) -> None:
     from tco.lora import select as layers
 
     for name, network in NETWORKS.items():
+        if network.missing():
+            continue
         path = EMBEDDED if network.checkpoint is None else written(tmp_path / name, network.kind)
         backbone = load(Selected(network, path, torch.device("cpu"), ""))
         assert backbone.stride == network.stride and backbone.name == network.kind

@@ -382,7 +382,7 @@ def test_other_settings_of_the_fusion_keep_the_depth_maps(fresh_room: Room) -> N
     assert anew.report["points"] == second.report["points"]
 
 
-@pytest.mark.parametrize("kind", ["vggt", "pi3"])
+@pytest.mark.parametrize("kind", ["vggt", "pi3", "da3"])
 def test_networks_that_predict_cameras_run_through(fresh_room: Room, tmp_path: Path, kind: str) -> None:
     """With random weights: every file is there, in COLMAP's cameras, and nobody is told that it is good."""
     from tests.colmap_tco.test_backbones import written
@@ -397,8 +397,13 @@ def test_networks_that_predict_cameras_run_through(fresh_room: Room, tmp_path: P
     assert len(read_ply(dense / "fused.ply")[0]) == len(read_vis(dense / "fused.ply.vis")) == report["points"]
     assert (report["points"] == 0) == bool(report["no_points"])
     assert report["backbone"]["name"] == kind and "holds weights of" in report["backbone"]["reason"]
-    assert report["backbone"]["licence"] == "CC BY-NC 4.0: " + (
-        "no commercial use" if kind == "pi3" else "no commercial use; for that there is vggt-commercial"
+    assert (
+        report["backbone"]["licence"]
+        == {
+            "vggt": "CC BY-NC 4.0: no commercial use; for that there is vggt-commercial",
+            "pi3": "CC BY-NC 4.0: no commercial use",
+            "da3": "Apache-2.0: commercial use allowed",
+        }[kind]
     )
     assert report["settings"]["tco"]["lora_targets"] == ["qkv", "proj", "fc1", "fc2"]
     (chunk,) = report["chunks"]

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from tco.backbones.base import Backbone
+from tco.backbones.da3 import DA3, DA3Config, DA3Network
 from tco.backbones.dinov2 import Patches, ViTConfig
 from tco.backbones.pi3 import Pi3, Pi3Config, Pi3Network
 from tco.backbones.vggt import VGGT, VGGTConfig, VGGTNetwork
@@ -31,6 +32,7 @@ TINY_VGGT = VGGTConfig(
     TINY_ENCODER, 32, 4, 2, registers=2, camera_depth=1, camera_heads=2, features=8, levels=(8, 8, 16, 16),
     layers=(0, 1, 2, 3),
 )  # fmt: skip
+TINY_DA3 = DA3Config(48, 8, 2, 2, (3, 5, 6, 7), 8, (8, 8, 8, 8), side=4)
 TINY_PI3 = Pi3Config(
     replace(TINY_ENCODER, mask_token=False), 32, 4, 2, registers=2, hidden=32, head_depth=1, head_heads=2,
     pose=16,
@@ -134,6 +136,13 @@ def tiny_vggt(**options: Any) -> VGGT:
 def tiny_pi3(**options: Any) -> Pi3:
     """A small π³ with random weights."""
     return Pi3(randomized(Pi3Network(TINY_PI3)), **options).eval().requires_grad_(False)
+
+
+def tiny_da3(**options: Any) -> DA3:
+    """A small Depth Anything 3 with random weights, whose fields of view are positive."""
+    network = randomized(DA3Network(TINY_DA3))
+    torch.nn.init.constant_(network.get_parameter("model.cam_dec.fc_fov.0.bias"), 1.0)
+    return DA3(network, **options).eval().requires_grad_(False)
 
 
 def check_subset(backbone: Backbone, chosen: Sequence[int]) -> None:

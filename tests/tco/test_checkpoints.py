@@ -13,9 +13,14 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from tco.backbones import pi3, vggt
-from tco.backbones.checkpoints import load_network, read, save
+from tco.backbones.checkpoints import load_network, read, save, tied
 from tco.backbones.weights import WeightsError
 from tests.tco.published import TINY_PI3, TINY_VGGT, some_views, tiny_pi3, tiny_vggt
+
+
+@dataclass(frozen=True)
+class Pair:
+    width: int
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +54,36 @@ def test_a_checkpoint_comes_back_as_it_was_written(
     ours, theirs = network.state_dict(), back.state_dict()
     assert ours.keys() == theirs.keys()
     assert all(torch.equal(ours[k], theirs[k]) for k in ours)
+
+
+def test_a_header_of_any_length_is_read(tmp_path: Path) -> None:
+    """A file of safetensors begins with a length, whose bytes may be those that other formats begin with."""
+    first = set()
+    for longer in range(0, 0x300, 8):
+        save_file({"a": torch.arange(3.0)}, tmp_path / "w", {"note": "x" * longer})
+        first.add((tmp_path / "w").read_bytes()[0])
+        assert read(tmp_path / "w")[0]["a"].tolist() == [0, 1, 2]
+    assert 0x80 in first
+
+
+def test_tied_parameters_are_written_once_and_read_back_under_each_name(tmp_path: Path) -> None:
+    class Tied(nn.Module):
+        def __init__(self, config: Pair) -> None:
+            super().__init__()
+            self.first = nn.Linear(config.width, config.width)
+            self.second = self.first
+
+    network = Tied(Pair(3))
+    assert tied(network) == [["first.weight", "second.weight"], ["first.bias", "second.bias"]]
+    save(tmp_path / "w", network, Pair(3))
+    assert set(read(tmp_path / "w")[0]) == {"first.weight", "first.bias"}
+    for name, content in {"one": read(tmp_path / "w")[0], "all": tensors_of(network)}.items():
+        save_file(content, tmp_path / name)
+        back = load_network(tmp_path / name, Tied, lambda tensors: Pair(len(tensors["first.bias"])))
+        assert back.second is back.first and torch.equal(back.second.weight, network.first.weight)
+    save_file({"second.weight": torch.zeros(3, 3)}, tmp_path / "half")
+    with pytest.raises(WeightsError, match=r"2 missing \(first\.bias, second\.bias\)"):
+        load_network(tmp_path / "half", Tied, Pair(3))
 
 
 @pytest.mark.parametrize(
