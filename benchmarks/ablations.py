@@ -19,7 +19,7 @@ from benchmarks.real import arguments, load, median_error, publish, within
 from tco.backbones.weights import EMBEDDED, load_sweep
 from tco.lora import select
 from tco.optimize import optimize
-from tco.options import AblationConfig, TCOConfig
+from tco.options import AblationConfig, PolishConfig, TCOConfig
 
 
 def variants(decoder: nn.Module, plain: TCOConfig) -> Iterator[tuple[str, TCOConfig]]:
@@ -33,7 +33,12 @@ def variants(decoder: nn.Module, plain: TCOConfig) -> Iterator[tuple[str, TCOCon
         return replace(config, ablation=AblationConfig(**changes))  # type: ignore[arg-type]
 
     yield "network alone", replace(plain, steps=0)
-    yield "default", plain
+    yield "adapted", plain
+    polish = PolishConfig()
+    yield "depths polished, network as it is", replace(plain, steps=1, rate=0.0, polish=polish)
+    yield "adapted, then polished (what densify does)", replace(plain, polish=polish)
+    fine = replace(polish, polish_levels=(1,))
+    yield "depths polished pixel by pixel", replace(plain, steps=1, rate=0.0, polish=fine)
     for rank in (1, 16):
         yield f"rank {rank}", replace(plain, lora_rank=rank)
     yield f"adapters on the last part only ({last})", replace(plain, lora_targets=(f"{last}.*",))
@@ -79,7 +84,9 @@ def main() -> None:
         "| | " + " | ".join(args.sets) + " |",
         "|---" * (len(sets) + 1) + "|",
     ]
-    for name, config in variants(network.decoder(), TCOConfig(steps=args.steps)):
+    for name, config in variants(
+        network.decoder(), TCOConfig(steps=args.steps, polish=PolishConfig(polish_steps=0))
+    ):
         if wanted and not any(word in name for word in wanted):
             continue
         cells = []

@@ -27,7 +27,7 @@ from tco.backbones.base import Backbone
 from tco.backbones.weights import EMBEDDED, load_sweep
 from tco.objective import NothingVisibleError, ObjectiveConfig, photometric
 from tco.optimize import optimize
-from tco.options import TCOConfig
+from tco.options import PolishConfig, TCOConfig
 from tco.surfels import from_depth
 from tco.types import Prediction
 
@@ -74,8 +74,8 @@ def measure(name: str, args: argparse.Namespace, reference: bool) -> Curve:
     """One schedule on one set."""
     torch.set_num_threads(args.threads)
     real, network = load(name, args.size, args.views), load_sweep(args.weights or EMBEDDED)
-    # Fixed cameras: the loss that is compared is that of the depths.
-    config = TCOConfig(steps=args.steps, camera_rate=0)
+    # Fixed cameras, and the network alone: the loss that is compared is that of its depths.
+    config = TCOConfig(steps=args.steps, camera_rate=0, polish=PolishConfig(polish_steps=0))
     backbone: Backbone = network
     if reference:
         config, backbone = config.reference_schedule(), Uncached(network)

@@ -56,7 +56,9 @@ class PolishConfig:
     polish_rate: float = knob(
         1e-3, "learning rate of the logarithms of the depths' factors (Adam); lower it if surfaces get rough"
     )
-    polish_sources: int = knob(2, "views that each of these steps renders from")
+    polish_sources: int = knob(
+        1, "views that each of these steps renders from; 2 are better and as much dearer"
+    )
     polish_levels: tuple[int, ...] = knob(
         (2, 8), "sides of the cells that share a factor, in pixels of the network's image; 1 follows noise"
     )
@@ -71,9 +73,11 @@ class TCOConfig:
     """Test-time constrained optimisation (Zhou et al., arXiv 2604.03878)."""
 
     steps: int = knob(
-        40, "optimisation steps of each chunk; 0 leaves the network as it is (plain feed-forward)"
+        10,
+        "optimisation steps of each chunk on the network; 0 leaves it as it is (plain feed-forward). The paper "
+        "takes 40, at half the rate",
     )
-    rate: float = knob(3.5e-4, "learning rate of the adapters (Adam); lower it if the loss jumps")
+    rate: float = knob(7e-4, "learning rate of the adapters (Adam); lower it if the loss jumps")
     lora_rank: int = knob(4, "rank of the adapters; more adapts more and overfits sooner")
     lora_alpha: float = knob(16.0, "adapters are scaled by alpha / rank")
     lora_targets: tuple[str, ...] = knob(
@@ -98,7 +102,7 @@ class TCOConfig:
         "probable cameras: 0.02 / 60. Raise it where large parts of the pictures mislead",
     )
     camera_rate: float = knob(
-        0.02,
+        0.05,
         "learning rate of the small corrections of the cameras, in standard deviations; 0 holds them fixed",
     )
     camera_kernel: str = knob(

@@ -32,7 +32,7 @@ from colmap_tco.progress import Progress
 from colmap_tco.tracks import covisibility, read_tracks
 from colmap_tco.views import ViewConfig
 from colmap_tco.workspace import open_workspace
-from tco.options import TCOConfig
+from tco.options import PolishConfig, TCOConfig
 
 if TYPE_CHECKING:
     from tests.conftest import Room
@@ -46,7 +46,7 @@ def config(steps: int = 0, **changes: Any) -> DensifyConfig:
     """Small images, so that a run takes seconds."""
     plain = DensifyConfig(
         network=NetworkConfig(device="cpu", chunk_size=8),
-        tco=TCOConfig(steps=steps),
+        tco=TCOConfig(steps=steps, polish=PolishConfig(polish_steps=1)),
         views=ViewConfig(max_image_size=128),
     )
     return replace(plain, **changes)
@@ -192,7 +192,7 @@ def test_the_report_says_what_was_done(done: Done) -> None:
     for figures in report["views"].values():
         assert figures["state"] == "used"
         assert figures["points"] > 50
-    assert [len(chunk) for chunk in report["loss"]] == [2]
+    assert [len(chunk) for chunk in report["loss"]] == [2 + 1]
     terms = {name for step in report["loss"][0] for name in step}
     assert {"photometric", "consistency", "sparse", "cameras", "loss"} <= terms
     held = report["held_out"]
@@ -373,7 +373,7 @@ def test_other_settings_of_the_fusion_keep_the_depth_maps(fresh_room: Room) -> N
         now = (second.folder / name).stat()
         assert (now.st_ino, now.st_mtime_ns) == (status.st_ino, status.st_mtime_ns)
     assert second.report["points"] > first.report["points"]
-    assert second.report["loss"] == first.report["loss"] and len(first.report["loss"][0]) == 1
+    assert second.report["loss"] == first.report["loss"] and len(first.report["loss"][0]) == 2
     assert second.report["views"] == first.report["views"]
     assert not made(fresh_room.root, loose).fresh
     anew = made(fresh_room.root, replace(loose, overwrite=True))
