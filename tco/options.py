@@ -74,8 +74,8 @@ class TCOConfig:
 
     steps: int = knob(
         10,
-        "optimisation steps of each chunk on the network; 0 leaves it as it is (plain feed-forward). The paper "
-        "takes 40, at half the rate",
+        "optimisation steps of each chunk on the network; 0 leaves it as it is (plain feed-forward). The "
+        "paper takes 40, at a lower rate",
     )
     rate: float = knob(7e-4, "learning rate of the adapters (Adam); lower it if the loss jumps")
     lora_rank: int = knob(4, "rank of the adapters; more adapts more and overfits sooner")
