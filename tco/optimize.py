@@ -21,7 +21,7 @@ from tco.options import TCOConfig
 from tco.penalties import sparse_depth
 from tco.polish import polish
 from tco.schedule import Sources, Stagnation, draw_targets
-from tco.terms import COMPATIBILITY, Terms, means
+from tco.terms import COMPATIBILITY, Terms, errors_at, means
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
 
 logger = logging.getLogger(__name__)
@@ -80,7 +80,7 @@ def optimize(
         report: called after every step with its number and its terms.
         watched: points of each view that nothing is fitted to. The history then holds ``held_out``: the mean
             over a step's sources of the median relative error at their points, as they are decoded in the
-            step, with a part of their input points hidden. It steers nothing.
+            step, with a part of their input points hidden, or refined in it. It steers nothing.
 
     Raises:
         ValueError: a term has a weight and its prior is missing, or nothing may change.
@@ -255,7 +255,7 @@ class _Run:
         depth = prediction.depth[prediction.views.index(source)].detach()
         found = {}
         if self.watched and len(self.watched[source]):
-            found["held_out"] = _errors(depth, self.watched[source]).abs().median()
+            found["held_out"] = errors_at(depth, self.watched[source]).abs().median()
         if self.stagnation is None or bool(shown.all()):
             return found
         hidden = sparse_depth(depth, self.terms.sparse[source][~shown])
@@ -329,7 +329,9 @@ class _Run:
         """The outcome with its depths refined, if that is wanted; where cameras are sought it is not."""
         if self.config.polish.polish_steps == 0 or self.priors.cameras is None:
             return outcome
-        done = polish(outcome.prediction, outcome.cameras, self.terms, self.config, self.generator, report)
+        done = polish(
+            outcome.prediction, outcome.cameras, self.terms, self.config, self.generator, report, self.watched
+        )
         return replace(
             outcome,
             prediction=done.prediction,
@@ -347,11 +349,4 @@ def errors_at_points(prediction: Prediction, points: Sequence[SparseDepth]) -> l
 
     The depth at a point is that of the pixel it falls into: what a user reads off the map.
     """
-    return [_errors(depth, sparse) for depth, sparse in zip(prediction.depth, points, strict=True)]
-
-
-def _errors(depth: Tensor, sparse: SparseDepth) -> Tensor:
-    """Relative errors (N,) of one depth map (H, W) at points."""
-    h, w = depth.shape
-    x, y = sparse.xy.long().unbind(-1)
-    return depth[y.clamp(0, h - 1), x.clamp(0, w - 1)] / sparse.depth - 1
+    return [errors_at(depth, sparse) for depth, sparse in zip(prediction.depth, points, strict=True)]

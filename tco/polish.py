@@ -23,8 +23,8 @@ from torch import Tensor, nn
 
 from tco.options import TCOConfig
 from tco.schedule import Sources, draw_targets
-from tco.terms import COMPATIBILITY, Terms, means
-from tco.types import Cameras, Prediction
+from tco.terms import COMPATIBILITY, Terms, errors_at, means
+from tco.types import Cameras, Prediction, SparseDepth
 
 logger = logging.getLogger(__name__)
 
@@ -87,6 +87,7 @@ def polish(
     config: TCOConfig,
     generator: torch.Generator,
     report: Callable[[int, dict[str, float]], None] | None = None,
+    watched: Sequence[SparseDepth] = (),
 ) -> Polished:
     """Refine the depths of all V views; confidences stay.
 
@@ -97,12 +98,30 @@ def polish(
         config: ``config.polish`` says how long and how fast; weights and targets are the adaptation's.
         generator: draws sources and targets.
         report: called after every step with its number, from ``config.steps`` on, and its terms.
+        watched: points of each view that nothing is fitted to; see :func:`tco.optimize.optimize`.
     """
-    c = config.polish
+    c, every = config.polish, range(len(prediction.depth))
     field = DepthField(prediction.depth, c.polish_levels)
     optimiser = torch.optim.Adam(field.parameters(), c.polish_rate)
     sources = Sources("epoch", terms.overlap, generator)
     weights = {k: v for k, v in terms.weights(config.steps, False).items() if k != "depth"}
+
+    def gradients(source: int, now: Prediction) -> dict[str, Tensor]:
+        """Terms of one source, whose gradients are added to those of the field."""
+        overlapping = draw_targets(terms.overlap, source, config.targets, generator)
+        targets = overlapping if weights.keys() & COMPATIBILITY else []
+        mine = _refined(prediction, field, [source])
+        part = terms.of_source(source, targets, mine, now, cameras, weights)
+        found = {name: value.detach() for name, value in part.items()}
+        if part:
+            # One source after the other, so that only one rendering is in memory.
+            loss = torch.stack([weights[name] * value for name, value in part.items()]).sum()
+            (loss / c.polish_sources).backward()
+            found["loss"] = loss.detach()
+        if watched and len(watched[source]):
+            found["held_out"] = errors_at(mine.depth[0].detach(), watched[source]).abs().median()
+        return found
+
     history: list[dict[str, float]] = []
     skipped: list[int] = []
     for step in range(c.polish_steps):
@@ -110,20 +129,9 @@ def polish(
             group["lr"] = c.polish_rate * (1 - (1 - LAST_RATE) * step / c.polish_steps)
         optimiser.zero_grad(set_to_none=True)
         with torch.no_grad():
-            now = _refined(prediction, field, range(len(prediction.depth)))
-        parts = []
-        for source in sources.draw(c.polish_sources):
-            targets = draw_targets(terms.overlap, source, config.targets, generator)
-            if not weights.keys() & COMPATIBILITY:
-                targets = []
-            mine = _refined(prediction, field, [source])
-            part = terms.of_source(source, targets, mine, now, cameras, weights)
-            if part:
-                # One source after the other, so that only one rendering is in memory.
-                loss = torch.stack([weights[name] * value for name, value in part.items()]).sum()
-                (loss / c.polish_sources).backward()
-                parts.append({name: value.detach() for name, value in part.items()} | {"loss": loss.detach()})
-        figures = {name: float(value) for name, value in means(parts).items()} or {"loss": 0.0}
+            now = _refined(prediction, field, every)
+        parts = means([gradients(source, now) for source in sources.draw(c.polish_sources)])
+        figures = {"loss": 0.0} | {name: float(value) for name, value in parts.items()}
         if _finite(field, figures["loss"]):
             optimiser.step()
         else:
@@ -133,7 +141,7 @@ def polish(
         if report is not None:
             report(config.steps + step, figures)
     with torch.no_grad():
-        return Polished(_refined(prediction, field, range(len(prediction.depth))), history, skipped)
+        return Polished(_refined(prediction, field, every), history, skipped)
 
 
 def _refined(prediction: Prediction, field: DepthField, views: Sequence[int]) -> Prediction:

@@ -150,6 +150,13 @@ class Terms:
         return angle + 2 * centres + 0.01 * penalties.focal(cameras.K, self.given.K)
 
 
+def errors_at(depth: Tensor, points: SparseDepth) -> Tensor:
+    """Relative errors (N,) of one depth map (H, W) at points: of the pixel that each falls into."""
+    h, w = depth.shape
+    x, y = points.xy.long().unbind(-1)
+    return depth[y.clamp(0, h - 1), x.clamp(0, w - 1)] / points.depth - 1
+
+
 def means(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
     """Mean of each term over the parts that have it, in the order of their first appearance."""
     names = dict.fromkeys(name for part in parts for name in part)

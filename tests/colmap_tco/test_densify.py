@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from tests.conftest import Room
 
 ROOT = Path(__file__).resolve().parents[2]
-FLAGS = ("--max_image_size", "128", "--chunk_size", "8", "--device", "cpu")
+FLAGS = ("--max_image_size", "128", "--chunk_size", "8", "--device", "cpu", "--polish_steps", "1")
 """The settings of :func:`config` on a command line."""
 
 

@@ -18,7 +18,8 @@ from tco.toy import Toy, Wall, wall
 from tco.types import Prediction
 
 CONFIG = TCOConfig(
-    camera_rate=0, polish=PolishConfig(polish_steps=24, polish_rate=4e-3, polish_levels=(4, 16))
+    camera_rate=0,
+    polish=PolishConfig(polish_steps=24, polish_rate=4e-3, polish_sources=2, polish_levels=(4, 16)),
 )
 
 
@@ -141,7 +142,11 @@ def test_what_is_not_finite_is_skipped(scene: Wall, caplog: pytest.LogCaptureFix
 def test_it_follows_the_steps_on_the_network(scene: Wall) -> None:
     config = replace(CONFIG, steps=2, lora_targets=("plane",), polish=PolishConfig(polish_steps=3))
     seen: list[int] = []
-    outcome = optimize(Toy(), scene.views, scene.priors, config, report=lambda step, _: seen.append(step))
+    watched = scene.priors.sparse or ()
+    outcome = optimize(
+        Toy(), scene.views, scene.priors, config, report=lambda step, _: seen.append(step), watched=watched
+    )
+    assert all(0 < step["held_out"] < 1 for step in outcome.history)
     assert seen == list(range(config.all_steps)) and len(outcome.history) == config.all_steps == 5
     plain = optimize(Toy(), scene.views, scene.priors, replace(config, polish=PolishConfig(polish_steps=0)))
     assert len(plain.history) == 2 and not torch.equal(plain.prediction.depth, outcome.prediction.depth)

@@ -30,14 +30,14 @@ from colmap_tco.progress import Progress
 from colmap_tco.tracks import read_tracks
 from colmap_tco.views import ViewConfig
 from colmap_tco.workspace import DensePaths, dense_paths
-from tco.options import TCOConfig
+from tco.options import PolishConfig, TCOConfig
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
     from tests.conftest import Room
 
-STEPS = 2
+TCO = TCOConfig(steps=2, polish=PolishConfig(polish_steps=3))
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def paths(room: Room, tmp_path_factory: pytest.TempPathFactory) -> DensePaths:
     shutil.copytree(room.root, root)
     config = DensifyConfig(
         network=NetworkConfig(device="cpu", chunk_size=8),
-        tco=TCOConfig(steps=STEPS),
+        tco=TCO,
         views=ViewConfig(max_image_size=128),
     )
     densify(root, config, Progress())
@@ -135,7 +135,7 @@ def test_errors_at_points_are_those_of_the_report(paths: DensePaths, embedded: d
 def test_every_step_has_its_terms_and_the_error_at_held_out_points(embedded: dict[str, Any]) -> None:
     (loss,) = embedded["loss"]
     assert {"loss", "photometric", "sparse", "held_out"} <= loss.keys()
-    assert all(len(values) == STEPS for values in loss.values())
+    assert all(len(values) == TCO.all_steps for values in loss.values())
     assert all(0 < value < 1 for value in loss["held_out"])
 
 
