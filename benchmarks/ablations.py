@@ -79,7 +79,8 @@ def main() -> None:
     wanted = [word for word in args.only.split(",") if word]
     lines = [
         "# Ablations\n",
-        f"`python -m benchmarks.ablations`: {args.views or 'all'} views of {args.size} pixels, {args.steps} "
+        f"`python -m benchmarks.ablations --sets {' '.join(args.sets)}`: {args.views or 'all'} views of "
+        f"{args.size} pixels, {args.steps} "
         f"steps, means of {args.seeds} run(s). Share of measured pixels within 5 %, median error, seconds.\n",
         "| | " + " | ".join(args.sets) + " |",
         "|---" * (len(sets) + 1) + "|",
