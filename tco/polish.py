@@ -104,7 +104,7 @@ def polish(
     field = DepthField(prediction.depth, c.polish_levels)
     optimiser = torch.optim.Adam(field.parameters(), c.polish_rate)
     sources = Sources("epoch", terms.overlap, generator)
-    weights = {k: v for k, v in terms.weights(config.steps, False).items() if k != "depth"}
+    weights = terms.weights(config.steps, False)
 
     def gradients(source: int, now: Prediction) -> dict[str, Tensor]:
         """Terms of one source, whose gradients are added to those of the field."""

@@ -120,6 +120,19 @@ def test_views_that_share_nothing_are_drawn_to_their_points(scene: Wall) -> None
     assert off(done.prediction, scene) < 0.6 * off(far, scene)
 
 
+def test_dense_depths_among_the_priors_are_used(scene: Wall) -> None:
+    """With no other term: the bump goes, as the prior has none."""
+    known = replace(scene, priors=replace(scene.priors, depth=scene.depth))
+    config = replace(
+        CONFIG, depth_weight=1.0, photometric_weight=0.0, consistency_weight=0.0, sparse_weight=0.0
+    )
+    wrong = predicted(scene, bump(scene, 0.04))
+    terms = Terms(known.views, known.priors, config)
+    done = polish(wrong, wrong.cameras, terms, config, torch.Generator().manual_seed(0))
+    assert all(step.keys() == {"depth", "loss"} for step in done.history)
+    assert done.history[-1]["depth"] < 0.7 * done.history[0]["depth"]
+
+
 def test_what_is_not_finite_is_skipped(scene: Wall, caplog: pytest.LogCaptureFixture) -> None:
     """Points of infinite depth: no step is taken, and the depths are as they were."""
     assert scene.priors.sparse is not None
