@@ -43,8 +43,8 @@ class TrainConfig:
 
     Attributes:
         steps: length of the cosine schedule. rate: peak learning rate. warmup: steps to reach it.
-        sizes: (share of the steps after which it starts, H, W) of the samples; a quarter keep
-            the size before.
+        sizes: (share of the steps after which it starts, H, W) of the samples.
+        share: of the samples that have the size reached last; the others keep the size before.
         refined: views a step whose refinement is trained; all views train the coarse stage.
         average: decay of the moving average of the weights.
         minutes: if not 0, the schedule runs by the clock and ends after so long, whatever ``steps`` says;
@@ -57,6 +57,7 @@ class TrainConfig:
     rate: float = 1e-3
     warmup: int = 150
     sizes: tuple[tuple[float, int, int], ...] = ((0.0, 96, 128), (0.6, 144, 192), (0.9, 192, 256))
+    share: float = 0.75
     refined: int = 3
     average: float = 0.995
     minutes: float = 0.0
@@ -241,7 +242,7 @@ class Trainer:
         rng = np.random.default_rng((c.seed, step, self.rank))
         progress = self.progress(step)
         reached = [s for s in c.sizes if s[0] <= progress]
-        _, h, w = reached[-1 if rng.random() < 0.75 else max(-2, -len(reached))]
+        _, h, w = reached[-1 if rng.random() < c.share else max(-2, -len(reached))]
         newest = (h, w) == tuple(c.sizes[-1][1:]) or rng.random() < c.newest
         folder = self.files[-1] if newest else self.files[rng.integers(len(self.files))]
         files = folder[c.held_out :]
@@ -366,6 +367,7 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=TrainConfig.rate)
     parser.add_argument("--minutes", type=float, default=TrainConfig.minutes)
     parser.add_argument("--sizes", type=Path, help="JSON of TrainConfig.sizes")
+    parser.add_argument("--share", type=float, default=TrainConfig.share, help="of the size reached last")
     parser.add_argument("--workers", type=int, default=2, help="processes that share each step")
     parser.add_argument("--threads", type=int, default=1, help="of each process")
     parser.add_argument("--device", default="cpu", help="cuda: several workers keep one GPU busy")
@@ -373,7 +375,7 @@ def main() -> None:
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / "meeting").unlink(missing_ok=True)
-    config = TrainConfig(steps=args.steps, rate=args.rate, minutes=args.minutes)
+    config = TrainConfig(steps=args.steps, rate=args.rate, minutes=args.minutes, share=args.share)
     if args.sizes is not None:
         config = replace(config, sizes=tuple(tuple(s) for s in json.loads(args.sizes.read_text())))
     if args.workers > 1:
