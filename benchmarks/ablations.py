@@ -37,6 +37,8 @@ def variants(decoder: nn.Module, plain: TCOConfig) -> Iterator[tuple[str, TCOCon
     polish = PolishConfig()
     yield "depths polished, network as it is", replace(plain, steps=1, rate=0.0, polish=polish)
     yield "adapted, then polished (what densify does)", replace(plain, polish=polish)
+    rendered = replace(polish, polish_renders=True)
+    yield "depths polished by rendering", replace(plain, steps=1, rate=0.0, polish=rendered)
     fine = replace(polish, polish_levels=(1,))
     yield "depths polished pixel by pixel", replace(plain, steps=1, rate=0.0, polish=fine)
     for rank in (1, 16):

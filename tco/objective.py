@@ -8,17 +8,15 @@ comparison would punish a correct occlusion.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from tco.config import knob
-from tco.geometry import invert, project, sample, transform, unproject
 from tco.render import Rendered, render
 from tco.surfels import Surfels
-from tco.types import Cameras, Prediction
+from tco.types import Cameras
 
 
 class NothingVisibleError(ValueError):
@@ -102,48 +100,6 @@ def geometric(
     config = config or ObjectiveConfig()
     rendered = render(surfels, cameras, _size(depth), config.renderer)
     return depth_difference(rendered, depth, weights(rendered, depth, valid, config))
-
-
-def consistency(
-    depth: Tensor,
-    cameras: Cameras,
-    source: int,
-    targets: Sequence[int],
-    context: Prediction,
-    tolerance: float = 0.02,
-) -> Tensor:
-    """Disagreement (scalar) of one view's depth with the depth that others predict for the same points.
-
-    Each pixel of the source is projected into the targets; with z its depth there and d the target's
-    depth sampled bilinearly in inverse depth, e = z / d − 1 costs τ log(1 + |e| / τ): L1 near zero, and
-    indifferent to occlusions, for which e is large. Mean over the projections that fall into a target,
-    weighted by the target's confidence c as an opacity, 1 − 1 / c: a guess is no evidence against another.
-
-    Args:
-        depth: (H, W) of the source, differentiable.
-        cameras: of all V views, differentiable.
-        source: index of the source.
-        targets: indices of the targets.
-        context: prediction for all V views, held constant.
-        tolerance: τ, relative.
-
-    Raises:
-        NothingVisibleError: no pixel of the source falls into a target.
-    """
-    h, w = depth.shape
-    chosen = list(targets)
-    target_from_source = invert(cameras.world_from_cam[chosen]) @ cameras.world_from_cam[source]
-    points = unproject(depth, cameras.K[source]).reshape(1, -1, 3)
-    xy, z = project(transform(target_from_source, points), cameras.K[chosen])
-    size = xy.new_tensor([w, h])
-    inside = (z > 1e-3) & ((xy >= 0.5) & (xy <= size - 0.5)).all(-1)
-    if not bool(inside.any()):
-        raise NothingVisibleError(f"no pixel of view {source} falls into one of the views {chosen}")
-    trust = 1 - 1 / context.confidence[chosen]
-    maps = torch.stack([1 / context.depth[chosen].clamp_min(1e-6), trust], 1).detach()
-    inverse, weight = (values[inside] for values in sample(maps, xy).unbind(1))
-    error = (z[inside] * inverse - 1).abs()
-    return (weight * tolerance * torch.log1p(error / tolerance)).sum() / weight.sum().clamp_min(1e-6)
 
 
 def weights(rendered: Rendered, depth: Tensor, valid: Tensor | None, config: ObjectiveConfig) -> Tensor:

@@ -59,6 +59,11 @@ class PolishConfig:
     polish_sources: int = knob(
         1, "views that each of these steps renders from; 2 are better and as much dearer"
     )
+    polish_renders: bool = knob(
+        False,
+        "compare colours by rendering surfels, as the steps on the network do, and not by warping; three "
+        "times dearer and no better",
+    )
     polish_levels: tuple[int, ...] = knob(
         (2, 8), "sides of the cells that share a factor, in pixels of the network's image; 1 follows noise"
     )

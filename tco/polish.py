@@ -2,9 +2,10 @@
 
 Adapters change what the network makes of all views at once, and cannot put right what it makes of one place.
 Here the network's answer D is held fixed and multiplied by a field of factors, exp(δ), of which δ is a sum of
-bilinearly interpolated grids, zero at first. The objective is that of the adaptation: surfels of a source
-compared with the other views in colour, depths with depths, depths with points. No network is run, so that a
-step costs a fraction of one that adapts, and all views' depths are those of the moment.
+bilinearly interpolated grids, zero at first. The objective is that of the adaptation: a source compared with
+the other views in colour, depths with depths, depths with points. Since each pixel has a depth of its own to
+move, colours are looked up where the pixel falls (:mod:`tco.warping`) and not rendered. No network is run, so
+that a step costs a fraction of one that adapts, and all views' depths are those of the moment.
 
 The paper optimises surfels directly as an ablation, without a network, and finds it worse (arXiv 2604.03878).
 Coarse grids make the difference: a grid of every pixel follows the noise of the pictures.
@@ -105,6 +106,8 @@ def polish(
     optimiser = torch.optim.Adam(field.parameters(), c.polish_rate)
     sources = Sources("epoch", terms.overlap, generator)
     weights = terms.weights(config.steps, False)
+    if not c.polish_renders and "photometric" in weights:
+        weights["warped"] = weights.pop("photometric")
 
     def gradients(source: int, now: Prediction) -> dict[str, Tensor]:
         """Terms of one source, whose gradients are added to those of the field."""

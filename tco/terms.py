@@ -10,14 +10,15 @@ from torch import Tensor
 
 from tco import penalties
 from tco.corrections import CameraCorrections
-from tco.objective import NothingVisibleError, ObjectiveConfig, consistency, geometric, photometric
+from tco.objective import NothingVisibleError, ObjectiveConfig, geometric, photometric
 from tco.options import TCOConfig
 from tco.surfels import Adjustment, SurfelConfig, Surfels, from_depth
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
+from tco.warping import disagreement, warp, warped_photometric
 
 logger = logging.getLogger(__name__)
 
-COMPATIBILITY = frozenset({"photometric", "geometric", "consistency"})
+COMPATIBILITY = frozenset({"photometric", "geometric", "warped", "consistency"})
 """Terms that compare a view with others."""
 
 
@@ -125,10 +126,20 @@ class Terms:
             terms["photometric"] = photometric(surfels, self.views.images[targets], cameras[targets], *there)
         if "geometric" in weights:
             terms["geometric"] = geometric(surfels, cameras[targets], *there)
+        if weights.keys() & {"warped", "consistency"}:
+            warped = warp(depth, self.views, cameras, source, targets, context)
+        if "warped" in weights:
+            image, opacity = self.views.images[source], self._opacity(source, prediction)
+            terms["warped"] = warped_photometric(warped, image, opacity, self.objective)
         if "consistency" in weights:
-            tolerance = self.config.consistency_tolerance
-            terms["consistency"] = consistency(depth, cameras, source, targets, context, tolerance)
+            terms["consistency"] = disagreement(warped, self.config.consistency_tolerance)
         return terms
+
+    def _opacity(self, source: int, prediction: Prediction) -> Tensor:
+        """Weight (H, W) of the pixels of a source: the opacity that their surfels have."""
+        confidence = prediction.confidence[prediction.views.index(source)]
+        opacity = 1 - 1 / confidence if self.surfels.confident_opacity else torch.ones_like(confidence)
+        return opacity * self.views.valid[source]
 
     def _surfels(
         self, source: int, prediction: Prediction, cameras: Cameras, adjust: Adjustment | None

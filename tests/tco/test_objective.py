@@ -16,7 +16,6 @@ from tco.objective import (
     NothingVisibleError,
     ObjectiveConfig,
     color_difference,
-    consistency,
     depth_difference,
     geometric,
     match_exposure,
@@ -25,7 +24,7 @@ from tco.objective import (
 )
 from tco.render import Rendered
 from tco.surfels import SurfelConfig, from_depth
-from tco.types import Cameras, Prediction
+from tco.types import Cameras
 
 PARITY = Path(__file__).parents[3] / "shared" / "parity"
 F64 = torch.float64
@@ -199,71 +198,6 @@ def test_constant_weights_have_no_derivative() -> None:
     assert not colors(given, targets, config).requires_grad
     colors(given, targets, PLAIN).backward()
     assert alpha.grad is not None and bool(alpha.grad.any())
-
-
-def two_views_of_a_wall(distance: float) -> tuple[Tensor, Cameras, Prediction]:
-    """Depth of a frontal wall in the first view, two cameras, and the second's exact prediction."""
-    K = torch.tensor([[30.0, 0, 16], [0, 30.0, 12], [0, 0, 1]], dtype=F64).expand(2, 3, 3)
-    pose = torch.eye(4, dtype=F64).repeat(2, 1, 1)
-    pose[1, :3, 3] = torch.tensor([0.2, 0.05, 0.5])
-    depth = torch.tensor([distance, distance - 0.5], dtype=F64)[:, None, None].expand(2, 24, 32)
-    return depth[0], Cameras(pose, K), Prediction(depth, 2 * torch.ones_like(depth), Cameras(pose, K), (0, 1))
-
-
-def test_consistency_of_agreeing_depths_is_zero_and_grows_with_the_error() -> None:
-    depth, cameras, context = two_views_of_a_wall(2.0)
-    assert float(consistency(depth, cameras, 0, [1], context)) == pytest.approx(0, abs=1e-12)
-    # 1 % more depth is 2.02 − 0.5 against 1.5: e = 0.02 / 1.5.
-    expected = 0.02 * np.log1p(0.02 / 1.5 / 0.02)
-    assert float(consistency(1.01 * depth, cameras, 0, [1], context)) == pytest.approx(expected)
-
-
-def test_consistency_trusts_targets_by_their_confidence() -> None:
-    """Of two targets, one wrong and of confidence 1, only the other counts."""
-    depth, cameras, context = two_views_of_a_wall(2.0)
-    wrong = replace(
-        context,
-        depth=torch.cat([context.depth, 1.3 * context.depth[1:]]),
-        confidence=torch.cat([context.confidence, torch.ones_like(context.confidence[1:])]),
-    )
-    three = cameras[[0, 1, 1]]
-    assert float(consistency(depth, three, 0, [1, 2], wrong)) == pytest.approx(0, abs=1e-12)
-    trusted = replace(wrong, confidence=2 * torch.ones_like(wrong.confidence))
-    assert float(consistency(depth, three, 0, [1, 2], trusted)) > 0.01
-
-
-def test_consistency_is_indifferent_to_occlusions() -> None:
-    """A wall far behind what the target sees pulls at a hundredth of the force of a small error."""
-    depth, cameras, context = two_views_of_a_wall(2.0)
-    forces = []
-    for factor in (1.001, 5.0):
-        leaf = (factor * depth).requires_grad_(True)
-        consistency(leaf, cameras, 0, [1], context).backward()
-        assert leaf.grad is not None
-        forces.append(float(leaf.grad.abs().max()))
-    assert forces[1] < 0.02 * forces[0]
-
-
-def test_consistency_without_overlap_is_an_error() -> None:
-    depth, cameras, context = two_views_of_a_wall(2.0)
-    pose = cameras.world_from_cam.clone()
-    pose[1, :3, 3] = torch.tensor([100.0, 0, 0])
-    with pytest.raises(NothingVisibleError, match="view 0"):
-        consistency(depth, Cameras(pose, cameras.K), 0, [1], context)
-
-
-def test_derivatives_of_consistency_match_finite_differences() -> None:
-    depth, cameras, context = two_views_of_a_wall(2.0)
-    bumpy = depth + 0.05 * torch.rand(24, 32, generator=torch.Generator().manual_seed(0), dtype=F64)
-    scale = torch.ones((), dtype=F64, requires_grad=True)
-    shift = torch.zeros(3, dtype=F64, requires_grad=True)
-
-    def f(scale: Tensor, shift: Tensor) -> Tensor:
-        pose = cameras.world_from_cam.clone()
-        pose[0, :3, 3] = shift
-        return consistency(scale * bumpy, Cameras(pose, cameras.K * scale), 0, [1], context)
-
-    assert torch.autograd.gradcheck(f, (scale, shift), eps=1e-8, atol=1e-5)
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.3, -0.3])

@@ -73,6 +73,19 @@ def test_a_level_is_linear_between_the_middles_of_its_cells() -> None:
     torch.testing.assert_close(field([0])[0, :, 2:-2], x[2:-2].expand(16, 20))
 
 
+def test_colours_are_warped_or_rendered_and_both_find_the_wall(scene: Wall) -> None:
+    """The two ways to compare colours are terms of their own; alone, warping takes most of a bump away."""
+    wrong = predicted(scene, bump(scene, 0.02))
+    assert scene.priors.cameras is not None
+    for renders, name, left in ((False, "warped", 0.6), (True, "photometric", 0.98)):
+        polished = replace(CONFIG.polish, polish_renders=renders)
+        config = replace(CONFIG, polish=polished, consistency_weight=0.0, sparse_weight=0.0)
+        terms = Terms(scene.views, scene.priors, config)
+        done = polish(wrong, scene.priors.cameras, terms, config, torch.Generator().manual_seed(0))
+        assert all(step.keys() == {name, "loss"} for step in done.history)
+        assert off(done.prediction, scene) < left * off(wrong, scene)
+
+
 def test_cells_must_have_a_size() -> None:
     for levels in ((), (0, 2)):
         with pytest.raises(ValueError, match="at least a pixel"):

@@ -3,7 +3,7 @@ import { css, data, digits, make, onSelect, percent, select, viridis } from './d
 import { axes, dense, sparse } from './scene.js';
 
 const TERMS = {
-  loss: 'Weighted sum that is lowered', photometric: 'Colours: rendered against seen', sparse: 'Error at the points that are used', consistency: 'Disagreement of the depths of two views',
+  loss: 'Weighted sum that is lowered', photometric: 'Colours: rendered against seen', warped: 'Colours: looked up against seen', sparse: 'Error at the points that are used', consistency: 'Disagreement of the depths of two views',
   geometric: 'Depths: rendered against predicted', depth: 'Departure from given depths', cameras: 'Departure from COLMAP’s cameras', hidden: 'Error at points that were hidden', held_out: 'Error at held-out points, of the view of each step',
 };
 

@@ -1,0 +1,198 @@
+"""A source's pixels looked up in other views: agreement in depth and colour, occlusions, derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tco.objective import NothingVisibleError, ObjectiveConfig
+from tco.toy import Wall, wall
+from tco.types import Cameras, Prediction, Views
+from tco.warping import Warped, disagreement, warp, warped_photometric
+
+F64 = torch.float64
+PLAIN = ObjectiveConfig()
+
+
+def blank(like: Tensor, views: int) -> Views:
+    """Black pictures of which all pixels are valid."""
+    h, w = like.shape[-2:]
+    shape = torch.zeros(views, 3, h, w, dtype=like.dtype)
+    return Views(shape, torch.ones(views, h, w, dtype=torch.bool), tuple(str(i) for i in range(views)))
+
+
+def consistency(
+    depth: Tensor, cameras: Cameras, source: int, targets: list[int], context: Prediction
+) -> Tensor:
+    return disagreement(warp(depth, blank(depth, len(cameras)), cameras, source, targets, context))
+
+
+def two_views_of_a_wall(distance: float) -> tuple[Tensor, Cameras, Prediction]:
+    """Depth of a frontal wall in the first view, two cameras, and the second's exact prediction."""
+    K = torch.tensor([[30.0, 0, 16], [0, 30.0, 12], [0, 0, 1]], dtype=F64).expand(2, 3, 3)
+    pose = torch.eye(4, dtype=F64).repeat(2, 1, 1)
+    pose[1, :3, 3] = torch.tensor([0.2, 0.05, 0.5])
+    depth = torch.tensor([distance, distance - 0.5], dtype=F64)[:, None, None].expand(2, 24, 32)
+    return depth[0], Cameras(pose, K), Prediction(depth, 2 * torch.ones_like(depth), Cameras(pose, K), (0, 1))
+
+
+def test_consistency_of_agreeing_depths_is_zero_and_grows_with_the_error() -> None:
+    depth, cameras, context = two_views_of_a_wall(2.0)
+    assert float(consistency(depth, cameras, 0, [1], context)) == pytest.approx(0, abs=1e-12)
+    # 1 % more depth is 2.02 − 0.5 against 1.5: e = 0.02 / 1.5.
+    expected = 0.02 * np.log1p(0.02 / 1.5 / 0.02)
+    assert float(consistency(1.01 * depth, cameras, 0, [1], context)) == pytest.approx(expected)
+
+
+def test_consistency_trusts_targets_by_their_confidence() -> None:
+    """Of two targets, one wrong and of confidence 1, only the other counts."""
+    depth, cameras, context = two_views_of_a_wall(2.0)
+    wrong = replace(
+        context,
+        depth=torch.cat([context.depth, 1.3 * context.depth[1:]]),
+        confidence=torch.cat([context.confidence, torch.ones_like(context.confidence[1:])]),
+    )
+    three = cameras[[0, 1, 1]]
+    assert float(consistency(depth, three, 0, [1, 2], wrong)) == pytest.approx(0, abs=1e-12)
+    trusted = replace(wrong, confidence=2 * torch.ones_like(wrong.confidence))
+    assert float(consistency(depth, three, 0, [1, 2], trusted)) > 0.01
+
+
+def test_consistency_is_indifferent_to_occlusions() -> None:
+    """A wall far behind what the target sees pulls at a hundredth of the force of a small error."""
+    depth, cameras, context = two_views_of_a_wall(2.0)
+    forces = []
+    for factor in (1.001, 5.0):
+        leaf = (factor * depth).requires_grad_(True)
+        consistency(leaf, cameras, 0, [1], context).backward()
+        assert leaf.grad is not None
+        forces.append(float(leaf.grad.abs().max()))
+    assert forces[1] < 0.02 * forces[0]
+
+
+def test_consistency_without_overlap_is_an_error() -> None:
+    depth, cameras, context = two_views_of_a_wall(2.0)
+    pose = cameras.world_from_cam.clone()
+    pose[1, :3, 3] = torch.tensor([100.0, 0, 0])
+    with pytest.raises(NothingVisibleError, match="view 0"):
+        consistency(depth, Cameras(pose, cameras.K), 0, [1], context)
+
+
+def test_derivatives_of_consistency_match_finite_differences() -> None:
+    depth, cameras, context = two_views_of_a_wall(2.0)
+    bumpy = depth + 0.05 * torch.rand(24, 32, generator=torch.Generator().manual_seed(0), dtype=F64)
+    scale = torch.ones((), dtype=F64, requires_grad=True)
+    shift = torch.zeros(3, dtype=F64, requires_grad=True)
+
+    def f(scale: Tensor, shift: Tensor) -> Tensor:
+        pose = cameras.world_from_cam.clone()
+        pose[0, :3, 3] = shift
+        return consistency(scale * bumpy, Cameras(pose, cameras.K * scale), 0, [1], context)
+
+    assert torch.autograd.gradcheck(f, (scale, shift), eps=1e-8, atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Wall:
+    return wall()
+
+
+def looked_up(scene: Wall, factor: float | Tensor = 1.0, targets: tuple[int, ...] = (1, 2)) -> Warped:
+    """The first view of the wall, its depth times a factor, in others whose depths are true."""
+    cameras = scene.priors.cameras
+    assert cameras is not None
+    context = Prediction(
+        scene.depth, torch.full_like(scene.depth, 5.0), cameras, tuple(range(len(scene.depth)))
+    )
+    return warp(factor * scene.depth[0], scene.views, cameras, 0, targets, context)
+
+
+def opaque(scene: Wall) -> Tensor:
+    return torch.ones_like(scene.depth[0])
+
+
+def test_what_a_target_shows_is_what_the_source_shows_where_the_depth_is_true(scene: Wall) -> None:
+    """Depths agree to rounding, colours to what interpolation leaves; not at wrong ones."""
+    right, wrong = looked_up(scene), looked_up(scene, 1.05)
+    assert float((right.ratio[right.valid] - 1).abs().max()) < 1e-4
+    torch.testing.assert_close(right.trust[right.valid], torch.full_like(right.trust[right.valid], 0.8))
+    image = scene.views.images[0].permute(1, 2, 0)
+    errors = [float((w.color - image).abs().mean(-1)[w.valid].mean()) for w in (right, wrong)]
+    assert errors[0] < 0.25 * errors[1]
+
+
+@pytest.mark.parametrize("structure", [0.0, 0.5])
+def test_the_colours_agree_best_at_the_true_depth(scene: Wall, structure: float) -> None:
+    config = ObjectiveConfig(structure=structure, exposure=True)
+    factors = np.linspace(0.98, 1.02, 41)
+    losses = [
+        float(warped_photometric(looked_up(scene, float(f)), scene.views.images[0], opaque(scene), config))
+        for f in factors
+    ]
+    assert abs(factors[int(np.argmin(losses))] - 1) < 1.1e-3
+
+
+def test_a_pixel_that_a_target_sees_something_nearer_at_does_not_count(scene: Wall) -> None:
+    """The target's depth is halved on its left: the pixels that fall there have no part in the loss."""
+    cameras = scene.priors.cameras
+    assert cameras is not None
+    depth = scene.depth.clone()
+    left = torch.zeros_like(depth[1], dtype=torch.bool)
+    left[:, : depth.shape[2] // 2] = True
+    depth[1, left] *= 0.5
+    images = scene.views.images.clone()
+    images[1, :, left] = 0.0
+    views = replace(scene.views, images=images)
+    context = Prediction(depth, torch.full_like(depth, 5.0), cameras, tuple(range(len(depth))))
+    warped = warp(scene.depth[0], views, cameras, 0, [1], context)
+    with_black = float(warped_photometric(warped, images[0], opaque(scene), PLAIN))
+    seen = warped.valid & (warped.ratio < 1.02)
+    assert 0.2 < float(seen.float().mean()) < 0.8
+    alone = replace(warped, valid=seen)
+    assert with_black == pytest.approx(float(warped_photometric(alone, images[0], opaque(scene), PLAIN)))
+    everything = replace(warped, ratio=torch.ones_like(warped.ratio))
+    assert float(warped_photometric(everything, images[0], opaque(scene), PLAIN)) > 3 * with_black
+
+
+def test_pixels_count_by_their_opacity(scene: Wall) -> None:
+    """The mean of two halves, weighted by opacity, is the mean over both: nothing couples them."""
+    warped, image = looked_up(scene, 1.01, (1,)), scene.views.images[0]
+    half = torch.zeros_like(opaque(scene))
+    half[:, : half.shape[1] // 2] = 1.0
+    parts = [float(warped_photometric(warped, image, o, PLAIN)) for o in (half, 1 - half)]
+    sums = [float((o * warped.valid[0]).sum()) for o in (half, 1 - half)]
+    mixed = float(warped_photometric(warped, image, 0.3 * half + 0.9 * (1 - half), PLAIN))
+    weights = np.array([0.3, 0.9]) * sums
+    assert mixed == pytest.approx(float(np.dot(weights, parts) / weights.sum()), rel=1e-5)
+
+
+def test_a_source_that_no_target_sees_is_an_error(scene: Wall) -> None:
+    warped = looked_up(scene)
+    behind = replace(warped, ratio=2 * torch.ones_like(warped.ratio))
+    with pytest.raises(NothingVisibleError, match="what the source view sees"):
+        warped_photometric(behind, scene.views.images[0], opaque(scene), PLAIN)
+
+
+def test_derivatives_of_the_warped_colours_match_finite_differences(scene: Wall) -> None:
+    """By depth and by a target's position, in float64, with exposure and structure."""
+    cameras = scene.priors.cameras
+    assert cameras is not None
+    config = ObjectiveConfig(structure=0.5, exposure=True, exposure_gradient=True)
+    views = replace(scene.views, images=scene.views.images.to(F64))
+    exact = Cameras(cameras.world_from_cam.to(F64), cameras.K.to(F64))
+    depth = scene.depth.to(F64)
+    context = Prediction(depth, torch.full_like(depth, 5.0), exact, tuple(range(len(depth))))
+
+    def f(scale: Tensor, shift: Tensor) -> Tensor:
+        pose = exact.world_from_cam.clone()
+        pose[1, :3, 3] = pose[1, :3, 3] + shift
+        there = warp(scale * depth[0], views, Cameras(pose, exact.K), 0, [1, 2], context)
+        return warped_photometric(there, views.images[0], opaque(scene).to(F64), config)
+
+    scale = torch.tensor(1.003, dtype=F64, requires_grad=True)
+    shift = torch.full((3,), 1e-3, dtype=F64, requires_grad=True)
+    assert torch.autograd.gradcheck(f, (scale, shift), eps=1e-7, atol=2e-4, rtol=2e-3)
