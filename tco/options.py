@@ -51,13 +51,21 @@ class PolishConfig:
     """Refinement of each pixel's depth after the network was adapted (``tco/polish.py``)."""
 
     polish_steps: int = knob(
-        30, "steps on the depths themselves, after those on the network; 0, or no steps at all: none"
+        60, "steps on the depths themselves, after those on the network; 0, or no steps at all: none"
     )
     polish_rate: float = knob(
-        1e-3, "learning rate of the logarithms of the depths' factors (Adam); lower it if surfaces get rough"
+        3e-3, "learning rate of the logarithms of the depths' factors (Adam); lower it if surfaces get rough"
     )
-    polish_sources: int = knob(
-        1, "views that each of these steps renders from; 2 are better and as much dearer"
+    polish_sources: int = knob(2, "views whose depths each of these steps looks at")
+    polish_smoothness: float = knob(
+        0.1,
+        "weight of the mean difference between the logarithms of the factors of neighbouring pixels, less "
+        "across edges of the picture; raise it if surfaces get rough",
+    )
+    polish_consistency: float = knob(
+        0.0,
+        "consistency_weight of these steps. Depths that are tied to each other move to the colours together "
+        "or not at all: wrong ones that agree stay",
     )
     polish_renders: bool = knob(
         False,
@@ -71,6 +79,8 @@ class PolishConfig:
     def __post_init__(self) -> None:
         if self.polish_steps < 0 or self.polish_sources < 1 or not self.polish_levels:
             raise ValueError("polish_steps must not be negative, and there must be a source and a level")
+        if self.polish_smoothness < 0 or self.polish_consistency < 0:
+            raise ValueError("polish_smoothness and polish_consistency are weights, not negative")
 
 
 @dataclass(frozen=True)
@@ -148,7 +158,7 @@ class TCOConfig:
     exposure: bool = knob(
         True, "match brightness and contrast of each pair of views before comparing colours"
     )
-    structure: float = knob(0.5, "share of the structural term (SSIM) in the comparison of colours")
+    structure: float = knob(0.85, "share of the structural term (SSIM) in the comparison of colours")
     clip: float = knob(1.0, "largest norm of the gradient")
     polish: PolishConfig = field(default_factory=PolishConfig)
     ablation: AblationConfig = field(default_factory=AblationConfig)

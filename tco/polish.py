@@ -105,9 +105,8 @@ def polish(
     field = DepthField(prediction.depth, c.polish_levels)
     optimiser = torch.optim.Adam(field.parameters(), c.polish_rate)
     sources = Sources("epoch", terms.overlap, generator)
-    weights = terms.weights(config.steps, False)
-    if not c.polish_renders and "photometric" in weights:
-        weights["warped"] = weights.pop("photometric")
+    weights = _weights(terms, config)
+    edges = picture_edges(terms.views.images)
 
     def gradients(source: int, now: Prediction) -> dict[str, Tensor]:
         """Terms of one source, whose gradients are added to those of the field."""
@@ -115,6 +114,8 @@ def polish(
         targets = overlapping if weights.keys() & COMPATIBILITY else []
         mine = _refined(prediction, field, [source])
         part = terms.of_source(source, targets, mine, now, cameras, weights)
+        if "smoothness" in weights:
+            part["smoothness"] = roughness(field([source])[0], [edge[source] for edge in edges])
         found = {name: value.detach() for name, value in part.items()}
         if part:
             # One source after the other, so that only one rendering is in memory.
@@ -145,6 +146,37 @@ def polish(
             report(config.steps + step, figures)
     with torch.no_grad():
         return Polished(_refined(prediction, field, every), history, skipped)
+
+
+def _weights(terms: Terms, config: TCOConfig) -> dict[str, float]:
+    """The adaptation's weights, with colours warped, and with what polishing weighs in its own way."""
+    c = config.polish
+    weights = terms.weights(config.steps, False)
+    if not c.polish_renders and "photometric" in weights:
+        weights["warped"] = weights.pop("photometric")
+    own = {"consistency": c.polish_consistency, "smoothness": c.polish_smoothness}
+    return {name: weight for name, weight in (weights | own).items() if weight > 0}
+
+
+EDGE = 0.1
+"""A step of the picture by this much, of 1, is an edge: it leaves a part 1 / e of the smoothness."""
+
+
+def picture_edges(images: Tensor) -> tuple[Tensor, Tensor]:
+    """exp(−|step| / ``EDGE``) between neighbours: (V, H, W − 1) along rows and (V, H − 1, W) down."""
+    across = (images[..., 1:] - images[..., :-1]).abs().mean(1)
+    down = (images[..., 1:, :] - images[..., :-1, :]).abs().mean(1)
+    return torch.exp(-across / EDGE), torch.exp(-down / EDGE)
+
+
+def roughness(field: Tensor, edges: Sequence[Tensor]) -> Tensor:
+    """Mean absolute step (scalar) of a field (H, W) from pixel to pixel, weighted; see :func:`picture_edges`.
+
+    The field, not the depth, is kept smooth: what the network sees of a surface's shape stays, and what it is
+    off by changes from one thing in the picture to the next.
+    """
+    across, down = edges
+    return (across * field.diff(dim=1).abs()).mean() + (down * field.diff(dim=0).abs()).mean()
 
 
 def _refined(prediction: Prediction, field: DepthField, views: Sequence[int]) -> Prediction:
