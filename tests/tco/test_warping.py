@@ -160,10 +160,11 @@ def test_a_pixel_that_a_target_sees_something_nearer_at_does_not_count(scene: Wa
 
 def test_pixels_count_by_their_opacity(scene: Wall) -> None:
     """The mean of two halves, weighted by opacity, is the mean over both: nothing couples them."""
-    warped, image = looked_up(scene, 1.01, (1,)), scene.views.images[0]
     half = torch.zeros_like(opaque(scene))
     half[:, : half.shape[1] // 2] = 1.0
+    warped, image = looked_up(scene, 1 + 0.03 * half, (1,)), scene.views.images[0]
     parts = [float(warped_photometric(warped, image, o, PLAIN)) for o in (half, 1 - half)]
+    assert parts[0] > 2 * parts[1]
     sums = [float((o * warped.valid[0]).sum()) for o in (half, 1 - half)]
     mixed = float(warped_photometric(warped, image, 0.3 * half + 0.9 * (1 - half), PLAIN))
     weights = np.array([0.3, 0.9]) * sums
