@@ -57,6 +57,7 @@ class _Points:
     Attributes:
         part: where they are from.
         kept: (K,) pixels of the part.
+        supports: (K,) views that agree on each, the reference included.
         local: (K, 3) in the frame of the reference.
         points: (K, 3) in the frame of the model.
         normals: (K, 3) there.
@@ -67,6 +68,7 @@ class _Points:
 
     part: _Part
     kept: NDArray[np.int64]
+    supports: NDArray[np.int64]
     local: NDArray[np.float32]
     points: NDArray[np.float64]
     normals: NDArray[np.float32]
@@ -160,9 +162,10 @@ class Reference:
             config.max_conflicts if config.max_conflicts > 0 else math.inf,
             math.cos(math.radians(config.min_tri_angle)) if config.min_tri_angle > 0 else math.inf,
         )
-        kept, removed = np.empty(part.count, np.int64), np.zeros(4, np.int64)
-        kept = kept[: _vote_kernels.accept(part.tiles, part.count, rules, kept, removed)]
-        count = len(kept)
+        kept, supports = np.empty(part.count, np.int64), np.empty(part.count, np.int64)
+        removed = np.zeros(4, np.int64)
+        count = _vote_kernels.accept(part.tiles, part.count, rules, kept, supports, removed)
+        kept, supports = kept[:count].copy(), supports[:count].copy()
         means = np.empty((count, 3), np.float32), np.empty((count, 3)), np.empty((count, 3), np.float32)
         pose = np.concatenate([view.cam_from_world[:3, :3], centre(view)[None]])
         _merge_kernels.average(part.tiles, kept, own.camera, pose, means)
@@ -170,7 +173,7 @@ class Reference:
         sampled = np.zeros(count, np.uint8)
         pair = _fusion_kernels.pair(own.camera, own.image_camera, np.eye(3, 4))
         _merge_kernels.sample_colors(means[0], np.arange(count), pair, own.image, samples, sampled)
-        return _Points(part, kept, *means, samples, sampled, removed)
+        return _Points(part, kept, supports, *means, samples, sampled, removed)
 
     def _color(self, points: _Points, group: Group) -> None:
         """Sample the colours of a group's images, and mark as taken the pixels that a point is made of."""
@@ -193,11 +196,10 @@ class Reference:
         _merge_kernels.median_colors(points.samples, points.sampled, colors)
         own = self._views[self._position].index
         theirs = np.array([self._views[p].index for p in self._neighbours], np.uint32)
-        counts = np.empty(len(points.kept), np.int64)
-        images = np.empty(_merge_kernels.supports(points.part.tiles, points.kept, counts), np.uint32)
+        start = np.concatenate([[0], points.supports]).cumsum()
+        images = np.empty(start[-1], np.uint32)
         order, before = np.argsort(theirs, kind="stable"), int((theirs < own).sum())
         _merge_kernels.list_views(points.part.who, points.kept, order, theirs, (before, own), images)
-        start = np.concatenate([[0], counts]).cumsum()
         return Cloud(points.points, points.normals, colors, Visibility(start, images))
 
     def _pair(self, slot: int, camera: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -17,7 +17,6 @@ from colmap_tco._vote_kernels import (
     NX,
     ROW,
     SHIFT,
-    SUPPORT,
     TILE,
     WEIGHT,
     Tiles,
@@ -164,18 +163,8 @@ def mark_taken(
         first, last = max(int(np.ceil(u - reach - 0.5)), 0), min(int(u + reach - 0.5), width - 1)
         for j in range(max(int(np.ceil(v - reach - 0.5)), 0), min(int(v + reach - 0.5), height - 1) + 1):
             for i in range(first, last + 1):
-                if abs(other[j, i, 0] - z) <= off:
+                if taken[j, i] == 0 and abs(other[j, i, 0] - z) <= off:
                     taken[j, i] = 1
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def supports(tiles: Tiles, kept: NDArray[np.int64], out: NDArray[np.int64]) -> int:
-    """Fill ``out`` (M,) with how many views agree on the pixels ``kept`` of ``tiles``; returns their sum."""
-    total = 0
-    for k in range(len(kept)):
-        out[k] = np.int64(tiles[kept[k] // TILE, SUPPORT + kept[k] % TILE])
-        total += out[k]
-    return total
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

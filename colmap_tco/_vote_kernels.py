@@ -63,10 +63,10 @@ def begin(ref: NDArray[np.float32], pixels: NDArray[np.int64], tiles: Tiles) -> 
     width, row = ref.shape[1], 0
     for t in range(len(tiles)):
         tile = tiles[t]
-        tile[:] = 0.0
-        tile[Z : Z + TILE] = np.nan
-        tile[SUPPORT : SUPPORT + TILE] = 1.0
-        tile[COSINE : COSINE + TILE] = 1.0
+        for m in range(TILE_SIZE):
+            tile[m] = 0.0
+        for m in range(TILE):
+            tile[Z + m], tile[SUPPORT + m], tile[COSINE + m] = np.nan, 1.0, 1.0
         for m in range(min(len(pixels) - t * TILE, TILE)):
             pixel = pixels[t * TILE + m]
             if pixel >= (row + 1) * width:
@@ -158,8 +158,9 @@ def _compare(tile: NDArray[np.float32], w: Scratch, pair: NDArray[np.float64]) -
 def _allow(tile: NDArray[np.float32], w: Scratch, limits: Limits) -> None:
     """The relative depth errors allowed between the pixels of a tile and those of the other view."""
     depth_error, _, _, sigma_at_one, most_depth_error = limits
+    for m in range(TILE):
+        w[_LIMIT + m] = depth_error
     if sigma_at_one <= 0.0:
-        w[_LIMIT : _LIMIT + TILE] = depth_error
         return
     for m in range(TILE):
         one, other = float(tile[CONFIDENCE + m]), w[_C + m]
@@ -288,6 +289,7 @@ def accept(
     count: int,
     rules: tuple[float, float, float, float],
     kept: NDArray[np.int64],
+    supports: NDArray[np.int64],
     removed: NDArray[np.int64],
 ) -> int:
     """List in ``kept`` (M,) the pixels of ``tiles``, by number, that have the support that they need.
@@ -298,6 +300,7 @@ def accept(
         rules: views wanted; the fewest that will do where no more see a pixel; conflicts allowed for a
             view of support, infinity for all; largest cosine of the widest angle.
         kept: is filled.
+        supports: (M,) is filled with the views that agree on each.
         removed: (4,) counts pixels with too many conflicts, with too little support, seen within too
             narrow an angle, and kept ones with less than the wanted support.
 
@@ -317,6 +320,6 @@ def accept(
             removed[2] += 1
         else:
             removed[3] += support < wanted
-            kept[found] = p
+            kept[found], supports[found] = p, np.int64(support)
             found += 1
     return found

@@ -76,7 +76,10 @@ def lossless(codes: NDArray[np.uint8]) -> str:
     import cv2
 
     if codes.ndim == 2:
-        return _uri("png", cv2.imencode(".png", codes, [cv2.IMWRITE_PNG_COMPRESSION, 9]))
+        # What the filter leaves of a map is noise without repetition: a search for it gains 5 % in 60 times
+        # the time.
+        runs = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+        return _uri("png", cv2.imencode(".png", codes, runs))
     rgb = np.ascontiguousarray(codes[..., ::-1])
     return _uri("webp", cv2.imencode(".webp", rgb, [cv2.IMWRITE_WEBP_QUALITY, 101]))
 
