@@ -319,7 +319,7 @@ def _write_chunk(
     for view in owned:
         r = done.views[view.name]
         maps, filled = fill(existing, view, r.maps) if existing else (r.maps, {})
-        outputs.write_maps(result.paths, view, maps)
+        outputs.write_maps(result.paths, view.name, maps)
         camera = r.corrected.camera
         # Rounded like the figures of the report, a camera in map coordinates would be metres off.
         exact = {
