@@ -1,10 +1,17 @@
 """Measure the fusion: depth pixels a second, memory, and how both grow with the number of views.
 
 ``python -m benchmarks.fusion`` fuses views of a rippled sphere, 640×480 pixels each, along an arc and prints
-a table; a row is a process of its own, so that its peak of the resident memory is its own. A depth pixel is
-counted once, as a pixel of a map; each is compared with ``--neighbours`` views. The CPU's seconds, and the
-pixels by these, hold on a busy machine too. ``--profile`` adds, for the
-smallest number of views, where the time goes on one thread.
+a table; a row is a process of its own, so that its peak of the resident memory is its own.
+
+What counts as depth pixels: all pixels of all depth maps, each once, however often it is read or compared;
+those that a filter drops and those that an earlier view's points cover are among them. The time is that of
+the whole fusion in memory, after a small one that loads the compiled loops; with ``--files`` it also holds
+the reading of the maps and the decoding of the images. Writing the cloud is not in it.
+
+The CPU's seconds hold on a busy machine too. From them: pixels a second of one core, and, where the threads
+would each have a core, pixels by the seconds of the calling thread, which alone does what is not parallel,
+and the others' share. ``--profile`` adds, for the smallest number of views, where the time goes on one
+thread.
 """
 
 from __future__ import annotations
@@ -16,8 +23,10 @@ import pstats
 import resource
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +34,9 @@ from numpy.typing import NDArray
 
 from colmap_tco.fusion import FusionConfig, FusionMaps, FusionView, fuse
 from colmap_tco.normals import normals_from_depth
+from colmap_tco.outputs import ViewMaps, read_view, write_image, write_maps
 from colmap_tco.pinhole import Pinhole
+from colmap_tco.workspace import DensePaths, dense_paths
 
 ROOT = Path(__file__).resolve().parents[1]
 Floats = NDArray[np.float64]
@@ -43,19 +54,21 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--neighbours", type=int, default=10)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--cache_size", type=float, default=4.0, help="gigabytes")
+    parser.add_argument("--files", action="store_true", help="read maps and images from files")
     parser.add_argument("--profile", action="store_true")
     parser.add_argument("--one", action="store_true", help="print the figures of the first number of views")
     options = parser.parse_args(argv)
     if options.one:
         print(json.dumps(measured(options)))
         return
-    print("| views | neighbours | threads | million depth pixels | points | seconds | CPU seconds "
-          "| million pixels/s | a core | read | held MB | peak MB |\n" + "|---" * 12 + "|")  # fmt: skip
+    print("| views | neighbours | threads | million depth pixels | points | seconds | CPU seconds | million "
+          "pixels/s | a core | all cores | read | held MB | peak MB |\n" + "|---" * 13 + "|")  # fmt: skip
     for views in options.views:
         r = in_process(options, views)
         print(f"| {views} | {options.neighbours} | {options.threads} | {r['pixels'] / 1e6:.2f} "
               f"| {r['points']:.0f} | {r['seconds']:.2f} | {r['busy']:.2f} "
               f"| {r['pixels'] / r['seconds'] / 1e6:.2f} | {r['pixels'] / r['busy'] / 1e6:.2f} "
+              f"| {r['pixels'] / (r['serial'] + (r['busy'] - r['serial']) / options.threads) / 1e6:.2f} "
               f"| {r['loads']:.0f} | {r['held'] / 1e6:.0f} | {r['peak'] / 1e6:.0f} |")  # fmt: skip
     if options.profile:
         profile(options)
@@ -67,6 +80,7 @@ def in_process(options: argparse.Namespace, views: int) -> dict[str, float]:
     words += [str(side) for side in options.size]
     for name in ("neighbours", "threads", "cache_size"):
         words += [f"--{name}", str(getattr(options, name))]
+    words += ["--files"] * options.files
     figures: dict[str, float] = json.loads(subprocess.check_output(words, cwd=ROOT, text=True))
     return figures
 
@@ -75,11 +89,16 @@ def measured(options: argparse.Namespace) -> dict[str, float]:
     """Seconds, bytes and counts of one fusion, after a small one that loads the compiled loops."""
     fuse(scene(3, (96, 72), 2), config(options))
     views = scene(options.views[0], tuple(options.size), options.neighbours)
-    start, busy = time.perf_counter(), time.process_time()
-    cloud, report = fuse(views, config(options))
+    with tempfile.TemporaryDirectory() as folder:
+        if options.files:
+            views = [in_files(view, dense_paths(Path(folder))) for view in views]
+        start, busy, serial = time.perf_counter(), time.process_time(), time.thread_time()
+        cloud, report = fuse(views, config(options))
+        spent = time.perf_counter() - start, time.process_time() - busy, time.thread_time() - serial
     return {
-        "seconds": time.perf_counter() - start,
-        "busy": time.process_time() - busy,
+        "seconds": spent[0],
+        "busy": spent[1],
+        "serial": spent[2],
         "pixels": report.pixels["all"],
         "points": len(cloud),
         "loads": report.loads,
@@ -112,6 +131,15 @@ def scene(count: int, size: tuple[int, int], neighbours: int) -> list[FusionView
         maps = maps_of(camera, pose)
         views.append(FusionView(f"{i:04d}.jpg", i, camera, pose, tuple(others), lambda maps=maps: maps))  # type: ignore[misc]
     return views
+
+
+def in_files(view: FusionView, paths: DensePaths) -> FusionView:
+    """The view with its maps and its image, a JPEG, in files, read as those of a dense workspace."""
+    maps = view.load()
+    assert maps.confidence is not None
+    write_maps(paths, view.name, ViewMaps(maps.depth, maps.normal, maps.confidence))
+    write_image(paths.image(view.name), maps.image)
+    return replace(view, load=lambda: read_view(paths, view.name))
 
 
 def pose_of(i: int) -> Floats:

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_tco import _fusion_kernels as kernels
+from colmap_tco import _fusion_kernels, _vote_kernels
 from colmap_tco._fusion_shelf import Shelf
-from colmap_tco.fusion import FusionConfig, FusionView, other_from_reference
+from colmap_tco.fusion_config import FusionConfig
+from colmap_tco.fusion_input import FusionView, other_from_reference
 from colmap_tco.fusion_report import Tolerance
 
 _VIEWS = 24
@@ -51,13 +52,15 @@ def _sample(shelf: Shelf, views: Sequence[FusionView], config: FusionConfig) -> 
     for position in _spread(range(len(views)), _VIEWS):
         ref = shelf.get(position)
         valid = np.flatnonzero(ref.packed[..., 0])
-        pixels = np.asarray(valid[:: max(1, len(valid) // _PIXELS)], np.int64)
+        pixels = np.ascontiguousarray(valid[:: max(1, len(valid) // _PIXELS)], np.int64)
+        tiles = _vote_kernels.tiles_of(len(pixels))
+        _vote_kernels.begin(ref.packed, pixels, tiles)
         for neighbour in _spread(sorted(views[position].neighbours[: config.check_num_images]), _NEIGHBOURS):
             other = shelf.get(neighbour)
             transform = other_from_reference(views[neighbour], views[position])
-            pair = kernels.pair(ref.camera, other.camera, transform)
+            pair = _fusion_kernels.pair(ref.camera, other.camera, transform)
             block = np.empty((len(pixels), 3))
-            blocks.append(block[: kernels.differences(ref.packed, pixels, other.packed, pair, block)])
+            blocks.append(block[: _vote_kernels.differences(tiles, other.packed, pair, block)])
     return np.concatenate(blocks)
 
 

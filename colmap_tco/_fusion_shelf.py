@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_tco import _fusion_kernels as kernels
-from colmap_tco.fusion import FusionConfig, FusionMaps, FusionView
+from colmap_tco.fusion_config import FusionConfig
+from colmap_tco.fusion_input import FusionMaps, FusionView
 from colmap_tco.maps import map_intrinsics
 from colmap_tco.workers import Workers
 
@@ -72,6 +73,7 @@ class Shelf:
         self._limit = config.cache_size * 1e9
         self._held: OrderedDict[int, ShelfView] = OrderedDict()
         self._bytes = 0
+        self._in_use: set[int] = set()
         self._taken: dict[int, NDArray[np.uint8]] = {}
         """One bit a pixel of the views that are not held."""
 
@@ -92,20 +94,53 @@ class Shelf:
         """Forget which pixels of a view are taken: it has been the reference."""
         self._taken.pop(position, None)
 
+    def together(self, reference: int, others: Sequence[int]) -> Iterator[list[tuple[int, ShelfView]]]:
+        """The other views with their numbers, in runs of as many as fit beside the reference, at least one.
+
+        The views of a run are held until the next is asked for.
+        """
+        run: list[tuple[int, ShelfView]] = []
+        try:
+            self._in_use = {reference}
+            self.get(reference)
+            for number, other in enumerate(others):
+                if run and not self._one_more():
+                    yield run
+                    run, self._in_use = [], {reference}
+                self._in_use.add(other)
+                run.append((number, self.get(other)))
+            if run:
+                yield run
+        finally:
+            self._in_use = set()
+
+    def _one_more(self) -> bool:
+        """Whether another view, as large as the largest held, fits beside those in use."""
+        used = sum(self._held[position].nbytes for position in self._in_use)
+        return used + self._largest() <= self._limit
+
+    def _largest(self) -> int:
+        return max((view.nbytes for view in self._held.values()), default=0)
+
     def _make_room(self) -> None:
         """Drop views as if the next were as large as the largest held, to keep the limit while reading."""
-        expected = max((view.nbytes for view in self._held.values()), default=0)
-        while len(self._held) > 1 and self._bytes + expected > self._limit:
-            self._drop_oldest()
+        expected = self._largest()
+        while len(self._held) > 1 and self._bytes + expected > self._limit and self._drop_oldest():
+            pass
 
     def _shrink(self) -> None:
-        while len(self._held) > 2 and self._bytes > self._limit:
-            self._drop_oldest()
+        while len(self._held) > 2 and self._bytes > self._limit and self._drop_oldest():
+            pass
 
-    def _drop_oldest(self) -> None:
-        position, view = self._held.popitem(last=False)
+    def _drop_oldest(self) -> bool:
+        """Drop the view that was used longest ago and is not in use; False if there is none."""
+        position = next((p for p in self._held if p not in self._in_use), None)
+        if position is None:
+            return False
+        view = self._held.pop(position)
         self._bytes -= view.nbytes
         self._taken[position] = np.packbits(view.taken)
+        return True
 
     def _prepare(self, position: int) -> ShelfView:
         view = self._views[position]
@@ -113,32 +148,40 @@ class Shelf:
         _check_maps(view, maps, self._config)
         shape = maps.depth.shape
         packed = np.empty((*shape, kernels.CHANNELS), np.float32)
-        packed[..., 0] = maps.depth
-        packed[..., 1:4] = maps.normal
-        packed[..., 4] = 1.0 if maps.confidence is None else maps.confidence
         camera = kernels.camera(map_intrinsics(view.camera, shape))
-        marks = np.zeros(shape, np.uint8)
-        if maps.mask is not None:
-            marks[~maps.mask] = kernels.MASKED
-        bounds = _bounds(self._config, view)
-        self.workers.run(
-            shape[0],
-            _ROWS,
-            lambda part: kernels.classify(packed, camera, bounds, (part.start, part.stop), marks),
-        )
-        packed[marks != kernels.KEEP, 0] = 0
+        arrays, bounds = _arrays(maps), _bounds(self._config, view)
+
+        def pack(part: slice) -> NDArray[np.int64]:
+            counts = np.zeros(kernels.NOT_FINITE + 1, np.int64)
+            kernels.pack(arrays, camera, bounds, (part.start, part.stop), packed, counts)
+            return counts
+
+        counts = np.sum(self.workers.run(shape[0], _ROWS, pack), 0)
+        if counts[kernels.NOT_FINITE]:
+            raise ValueError(f"{view.name}: depths and normals must be finite; mark missing ones with 0")
         taken = np.zeros(shape, np.uint8)
         if position in self._taken:
-            taken = np.unpackbits(self._taken.pop(position), count=marks.size).reshape(shape)
-        numbers = np.bincount(marks.ravel(), minlength=kernels.FAR + 1)
+            taken = np.unpackbits(self._taken.pop(position), count=taken.size).reshape(shape)
         return ShelfView(
             packed,
             camera,
             np.ascontiguousarray(maps.image),
             kernels.camera(map_intrinsics(view.camera, maps.image.shape)),
             taken,
-            {name: int(numbers[mark]) for name, mark in _MARKS.items()},
+            {name: int(counts[mark]) for name, mark in _MARKS.items()},
         )
+
+
+def _arrays(maps: FusionMaps) -> kernels.Maps:
+    """The maps as the loop takes them; where there is no confidence, it is 1."""
+    shape = maps.depth.shape
+    confidence = np.ones(shape, np.float32) if maps.confidence is None else maps.confidence
+    return (
+        np.ascontiguousarray(maps.depth, np.float32),
+        np.ascontiguousarray(maps.normal, np.float32),
+        np.ascontiguousarray(confidence, np.float32),
+        np.zeros((0, 0), bool) if maps.mask is None else np.ascontiguousarray(maps.mask, bool),
+    )
 
 
 def _bounds(config: FusionConfig, view: FusionView) -> tuple[float, float, float, float]:
@@ -160,5 +203,3 @@ def _check_maps(view: FusionView, maps: FusionMaps, config: FusionConfig) -> Non
         raise ValueError(
             f"{view.name}: the image must be (H, W, 3) uint8, not {maps.image.shape} {maps.image.dtype}"
         )
-    if not np.isfinite(maps.depth).all() or not np.isfinite(maps.normal).all():
-        raise ValueError(f"{view.name}: depths and normals must be finite; mark missing ones with 0")

@@ -9,77 +9,104 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from colmap_tco._fusion_kernels import Votes, move, ray
+from colmap_tco._fusion_kernels import move
+from colmap_tco._vote_kernels import (
+    COL,
+    CONFIDENCE,
+    NORMAL_SUM,
+    NX,
+    ROW,
+    SHIFT,
+    TILE,
+    WEIGHT,
+    Tiles,
+    Z,
+)
+
+Points = tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float32]]
+"""M points: (M, 3) in the frame of the reference, (M, 3) in that of the model, normals (M, 3) there."""
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def average(
-    ref: NDArray[np.float32],
-    camera: NDArray[np.float64],
-    pixels: NDArray[np.int64],
-    votes: Votes,
-    points: NDArray[np.float32],
-    normals: NDArray[np.float32],
+    tiles: Tiles, kept: NDArray[np.int64], camera: NDArray[np.float64], pose: NDArray[np.float64], out: Points
 ) -> None:
-    """Fill ``points`` and ``normals`` (M, 3) of the reference frame with the weighted means of the votes."""
-    _, _, _, weights, shifts, theirs, _, _ = votes
-    width = ref.shape[1]
-    for m in range(len(pixels)):
-        row = pixels[m] // width
-        col = pixels[m] - row * width
-        x, y = ray(camera, row, col)
-        z = float(ref[row, col, 0])
-        own = float(ref[row, col, 4])
-        scale = 1.0 / (own + weights[m])
-        points[m, 0] = x * z + shifts[m, 0] * scale
-        points[m, 1] = y * z + shifts[m, 1] * scale
-        points[m, 2] = z + shifts[m, 2] * scale
+    """Fill ``out`` with the weighted means of the votes on the pixels ``kept`` (M,) of ``tiles``.
+
+    ``pose`` (4, 3) holds the rotation of cam_from_world and, in the last row, the camera's position.
+    """
+    local, points, normals = out
+    n, p = np.empty(3), np.empty(3)
+    for k in range(len(kept)):
+        tile, m = tiles[kept[k] // TILE], kept[k] % TILE
+        z, own = float(tile[Z + m]), float(tile[CONFIDENCE + m])
+        scale = 1.0 / (own + tile[WEIGHT + m])
+        x = (float(tile[COL + m]) + 0.5 - camera[2]) * camera[4]
+        y = (float(tile[ROW + m]) + 0.5 - camera[3]) * camera[5]
+        p[0], p[1], p[2] = x * z, y * z, z
         length = 0.0
         for axis in range(3):
-            normals[m, axis] = own * ref[row, col, 1 + axis] + theirs[m, axis]
-            length += normals[m, axis] ** 2
-        length = np.sqrt(length)
+            p[axis] += tile[SHIFT + axis * TILE + m] * scale
+            n[axis] = own * tile[NX + axis * TILE + m] + tile[NORMAL_SUM + axis * TILE + m]
+            length += n[axis] * n[axis]
+        length = 1.0 / np.sqrt(length)
         for axis in range(3):
-            normals[m, axis] /= length
+            local[k, axis] = p[axis]
+            points[k, axis] = (
+                p[0] * pose[0, axis] + p[1] * pose[1, axis] + p[2] * pose[2, axis] + pose[3, axis]
+            )
+            turned = n[0] * pose[0, axis] + n[1] * pose[1, axis] + n[2] * pose[2, axis]
+            normals[k, axis] = turned * length
 
 
-@njit(cache=True, error_model="numpy")
-def _bilinear(image: NDArray[np.uint8], u: float, v: float, out: NDArray[np.uint8]) -> None:
-    """RGB of ``image`` at (u, v), clamped to the border, into ``out`` (3,)."""
-    height, width = image.shape[0], image.shape[1]
-    u, v = min(max(u - 0.5, 0.0), width - 1.0), min(max(v - 0.5, 0.0), height - 1.0)
-    i, j = min(int(u), max(width - 2, 0)), min(int(v), max(height - 2, 0))
-    a, b = u - i, v - j
-    right, below = min(i + 1, width - 1), min(j + 1, height - 1)
-    for c in range(3):
-        top = (1.0 - a) * image[j, i, c] + a * image[j, right, c]
-        bottom = (1.0 - a) * image[below, i, c] + a * image[below, right, c]
-        out[c] = np.uint8((1.0 - b) * top + b * bottom + 0.5)
+@njit(cache=True, error_model="numpy", nogil=True)
+def agreeing(who: NDArray[np.uint64], kept: NDArray[np.int64], bit: np.uint64, out: NDArray[np.int64]) -> int:
+    """List in ``out`` which of the points have ``bit`` set in ``who`` at ``kept`` (M,); returns how many."""
+    found = 0
+    for k in range(len(kept)):
+        out[found] = k
+        found += (who[kept[k]] & bit) != 0
+    return found
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def sample_colors(
     points: NDArray[np.float32],
-    who: NDArray[np.bool_],
+    chosen: NDArray[np.int64],
     pair: NDArray[np.float64],
     image: NDArray[np.uint8],
     samples: NDArray[np.uint8],
     count: NDArray[np.uint8],
 ) -> None:
-    """Append the colour of each of ``points`` (M, 3) that ``who`` (M,) selects to ``samples`` (M, S, 3).
+    """Append the colours of the ``chosen`` of ``points`` (M, 3) to ``samples`` (M, S, 3).
 
-    The second camera of ``pair`` is that of ``image``, which may be larger than the maps. ``count``
-    (M,) says how many samples there are already; beyond S no more are taken.
+    The second camera of ``pair`` is that of ``image``, which may be larger than the maps; it is read
+    bilinearly, and clamped to its border. ``count`` (M,) says how many samples there are already; beyond
+    S no more are taken.
     """
-    for m in range(len(points)):
-        if not who[m] or count[m] >= samples.shape[1]:
+    height, width = image.shape[0], image.shape[1]
+    fx, fy, cx, cy = pair[6], pair[7], pair[8] - 0.5, pair[9] - 0.5
+    right, bottom = width - 1.0, height - 1.0
+    for k in chosen:
+        n = count[k]
+        if n >= samples.shape[1]:
             continue
-        x, y, z = move(pair, points[m, 0], points[m, 1], points[m, 2])
+        x, y, z = move(pair, points[k, 0], points[k, 1], points[k, 2])
         if z <= 0.0:
             continue
-        u, v = pair[6] * x / z + pair[8], pair[7] * y / z + pair[9]
-        _bilinear(image, u, v, samples[m, count[m]])
-        count[m] += 1
+        inverse = 1.0 / z
+        u, v = min(max(fx * (x * inverse) + cx, 0.0), right), min(max(fy * (y * inverse) + cy, 0.0), bottom)
+        i, j = np.uint64(u), np.uint64(v)
+        a, b = u - np.float64(i), v - np.float64(j)
+        beside, below = (
+            min(i + np.uint64(1), np.uint64(width - 1)),
+            min(j + np.uint64(1), np.uint64(height - 1)),
+        )
+        for c in range(3):
+            top = (1.0 - a) * image[j, i, c] + a * image[j, beside, c]
+            base = (1.0 - a) * image[below, i, c] + a * image[below, beside, c]
+            samples[k, n, c] = np.uint8((1.0 - b) * top + b * base + 0.5)
+        count[k] = n + 1
 
 
 @njit(cache=True, error_model="numpy")
@@ -111,63 +138,61 @@ def median_colors(samples: NDArray[np.uint8], count: NDArray[np.uint8], out: NDA
 @njit(cache=True, error_model="numpy", nogil=True)
 def mark_taken(
     points: NDArray[np.float32],
-    who: NDArray[np.bool_],
-    footprint: NDArray[np.float32],
+    chosen: NDArray[np.int64],
     other: NDArray[np.float32],
     pair: NDArray[np.float64],
     depth_error: float,
     taken: NDArray[np.uint8],
 ) -> None:
-    """Set ``taken`` (H, W) at the pixels of another view that ``points`` (M, 3) have been made of.
+    """Set ``taken`` (H, W) at the pixels of another view that the ``chosen`` of ``points`` (M, 3) cover.
 
-    A point covers ``footprint`` (M,) units of length, the size of its pixel in the reference. The
-    pixels of the other view whose centres lie within that square, widened by half so that no gap
-    remains between the squares of neighbours, are the same surface seen again; a view that sees it
-    finer than two to one keeps the rest of its pixels, for they add detail. Threads may set the
-    same pixel to the same 1.
+    A point covers what its pixel in the reference does. The pixels of the other view whose centres lie
+    within that square, widened by half so that no gap remains between the squares of neighbours, are the
+    same surface seen again; a view that sees it finer than two to one keeps the rest of its pixels, for
+    they add detail. Threads may set the same pixel to the same 1.
     """
     height, width = taken.shape
-    for m in range(len(points)):
-        if not who[m]:
-            continue
-        x, y, z = move(pair, points[m, 0], points[m, 1], points[m, 2])
-        u, v = pair[6] * x / z + pair[8], pair[7] * y / z + pair[9]
+    for k in chosen:
+        x, y, z = move(pair, points[k, 0], points[k, 1], points[k, 2])
+        inverse = 1.0 / z
+        u, v = pair[6] * (x * inverse) + pair[8], pair[7] * (y * inverse) + pair[9]
         if z <= 0.0 or not (0.0 <= u < width and 0.0 <= v < height):
             continue
         taken[int(v), int(u)] = 1
-        reach = 0.75 * min(footprint[m] * pair[6] / z, 2.0)
+        reach, off = 0.75 * min(points[k, 2] * pair[4] * pair[6] * inverse, 2.0), depth_error * z
+        first, last = max(int(np.ceil(u - reach - 0.5)), 0), min(int(u + reach - 0.5), width - 1)
         for j in range(max(int(np.ceil(v - reach - 0.5)), 0), min(int(v + reach - 0.5), height - 1) + 1):
-            for i in range(max(int(np.ceil(u - reach - 0.5)), 0), min(int(u + reach - 0.5), width - 1) + 1):
-                if abs(other[j, i, 0] - z) <= depth_error * z:
+            for i in range(first, last + 1):
+                if taken[j, i] == 0 and abs(other[j, i, 0] - z) <= off:
                     taken[j, i] = 1
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def list_views(
     who: NDArray[np.uint64],
+    kept: NDArray[np.int64],
     slots: NDArray[np.int64],
     indices: NDArray[np.uint32],
     own: tuple[int, int],
-    start: NDArray[np.int64],
     images: NDArray[np.uint32],
 ) -> None:
     """Fill ``images`` with the views that agree on each point (M,) and the reference, in ascending order.
 
     Args:
-        who: (M, words) one bit for each neighbour that agrees.
+        who: (words, pixels) one bit for each neighbour that agrees.
+        kept: (M,) pixels of the points.
         slots: the neighbours in ascending order of their index.
         indices: of the neighbours, by slot.
         own: how many of ``slots`` come before the reference, and its index.
-        start: (M + 1,) where the list of each point begins.
-        images: all lists.
+        images: all lists, one after the other.
     """
     before, index = own
-    for m in range(len(who)):
-        at = start[m]
-        for k in range(len(slots) + 1):
-            if k == before:
+    at = 0
+    for k in kept:
+        for s in range(len(slots) + 1):
+            if s == before:
                 images[at] = index
                 at += 1
-            if k < len(slots) and (who[m, slots[k] >> 6] >> np.uint64(slots[k] & 63)) & np.uint64(1):
-                images[at] = indices[slots[k]]
+            if s < len(slots) and (who[slots[s] >> 6, k] >> np.uint64(slots[s] & 63)) & np.uint64(1):
+                images[at] = indices[slots[s]]
                 at += 1

@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 from colmap_tco import flags
 from colmap_tco.commands import COMMANDS, Command
 from colmap_tco.errors import DensifyError, OutOfMemoryError, is_out_of_memory
+from colmap_tco.kernel_cache import ensure_kernel_cache
 from colmap_tco.progress import Progress
 
 logger = logging.getLogger(__name__)
@@ -49,6 +50,7 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Command] = CO
         options, _ = _global_options().parse_known_args(words)
         outcome.show_traceback = options.verbose > 0
         configure_logging(options.verbose - options.quiet, options.log_json)
+        ensure_kernel_cache()
         name, given, config = _parse(words, commands)
         draw = _on_terminal() and not options.log_json and not options.quiet
         with _sigterm_interrupts(), Progress(bar=draw) as progress, _logging_beside_bar(draw):

@@ -278,6 +278,7 @@ def _predict(
         return predict_chunk(
             (backbone, chosen.device), tracks, views, chunk, settings,
             lambda terms: progress.advance(1, **{k: terms[k] for k in SHOWN if k in terms}),
+            lambda view, image: outputs.write_image(result.paths.image(view.name), image),
         )  # fmt: skip
 
     for attempt in within_memory(todo, pairs.common, work, budget.views_now, lambda: release(chosen.device)):
@@ -318,7 +319,7 @@ def _write_chunk(
     for view in owned:
         r = done.views[view.name]
         maps, filled = fill(existing, view, r.maps) if existing else (r.maps, {})
-        outputs.write_view(result.paths, view, maps)
+        outputs.write_maps(result.paths, view.name, maps)
         camera = r.corrected.camera
         # Rounded like the figures of the report, a camera in map coordinates would be metres off.
         exact = {

@@ -54,3 +54,15 @@ class FusionView:
     neighbours: tuple[int, ...]
     load: Callable[[], FusionMaps]
     reach: float = math.inf
+
+
+def other_from_reference(other: FusionView, reference: FusionView) -> NDArray[np.float64]:
+    """The (3, 4) transform between two cameras, without loss where world coordinates are large."""
+    rotation = other.cam_from_world[:3, :3] @ reference.cam_from_world[:3, :3].T
+    shift = other.cam_from_world[:3, :3] @ (centre(reference) - centre(other))
+    return np.ascontiguousarray(np.concatenate([rotation, shift[:, None]], 1))
+
+
+def centre(view: FusionView) -> NDArray[np.float64]:
+    """World position (3,) of the camera."""
+    return -view.cam_from_world[:3, :3].T @ view.cam_from_world[:3, 3]

@@ -51,6 +51,7 @@ def normals_from_depth(
     depth = np.ascontiguousarray(depth, np.float32)
     inverse = np.zeros_like(depth)
     np.divide(1.0, depth, out=inverse, where=depth > 0)
+    bordered = _normal_kernels.bordered(inverse, radius)
     normals = np.empty((*depth.shape, 3), np.float32)
     intrinsics = map_intrinsics(camera, depth.shape)
     with Workers(num_threads) as workers:
@@ -58,7 +59,7 @@ def normals_from_depth(
             len(depth),
             _ROWS,
             lambda part: _normal_kernels.plane_normals(
-                inverse, intrinsics, radius, (part.start, part.stop), normals
+                bordered, intrinsics, radius, (part.start, part.stop), normals
             ),
         )
     return normals

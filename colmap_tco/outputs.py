@@ -58,9 +58,18 @@ def write_view(paths: DensePaths, view: View, maps: ViewMaps) -> None:
     """
     image, _ = undistorted_image(view)
     write_image(paths.image(view.name), image)
-    write_map(paths.depth_map(view.name), maps.depth)
-    write_map(paths.normal_map(view.name), maps.normal)
-    write_map(paths.confidence_map(view.name), maps.confidence)
+    write_maps(paths, view.name, maps)
+
+
+def write_maps(paths: DensePaths, name: str, maps: ViewMaps) -> None:
+    """Write the three maps of a view.
+
+    Raises:
+        ValueError: a map holds a value that is not finite.
+    """
+    write_map(paths.depth_map(name), maps.depth)
+    write_map(paths.normal_map(name), maps.normal)
+    write_map(paths.confidence_map(name), maps.confidence)
 
 
 def write_image(path: Path, image: NDArray[np.uint8]) -> None:

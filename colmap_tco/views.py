@@ -13,7 +13,7 @@ Views of one chunk are padded symmetrically to a common canvas, which keeps prin
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -236,15 +236,21 @@ def _read_mask(view: View) -> NDArray[Any] | None:
     return mask
 
 
-def network_image(view: View) -> tuple[NDArray[np.float32], Mask]:
+Take = Callable[[View, NDArray[np.uint8]], None]
+"""Is given a view and its undistorted image (H, W, 3)."""
+
+
+def network_image(view: View, take: Take | None = None) -> tuple[NDArray[np.float32], Mask]:
     """RGB (h, w, 3) in [0, 1] in the frame of ``view.network``, and its valid pixels (h, w).
 
     Area-filtered. Only valid pixels contribute, so that padding does not darken the border; a pixel
-    is valid if at least half of its area is.
+    is valid if at least half of its area is. ``take`` is given the undistorted image that they are of.
     """
     import cv2
 
     image, valid = undistorted_image(view)
+    if take is not None:
+        take(view, image)
     size = (view.network.width, view.network.height)
     weight = valid.astype(np.float32)
     share = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
@@ -291,8 +297,13 @@ def canvas_cameras(views: Sequence[View], frame: ChunkFrame) -> Cameras:
     return Cameras(torch.from_numpy(poses).float(), torch.from_numpy(K).float())
 
 
-def batch(views: Sequence[View], frame: ChunkFrame) -> tuple[Views, Cameras]:
+def batch(views: Sequence[View], frame: ChunkFrame, take: Take | None = None) -> tuple[Views, Cameras]:
     """Images and cameras of a chunk on a common canvas, float32.
+
+    Args:
+        views: of the chunk.
+        frame: of the chunk.
+        take: is given each view and its undistorted image, which takes long to make and is not kept.
 
     Raises:
         InputError: an image cannot be read.
@@ -305,7 +316,7 @@ def batch(views: Sequence[View], frame: ChunkFrame) -> tuple[Views, Cameras]:
     images = torch.zeros(len(views), 3, *canvas)
     valid = torch.zeros(len(views), *canvas, dtype=torch.bool)
     for i, view in enumerate(views):
-        rgb, keep = network_image(view)
+        rgb, keep = network_image(view, take)
         crop(view, images[i])[:] = torch.from_numpy(rgb).permute(2, 0, 1)
         crop(view, valid[i])[:] = torch.from_numpy(keep)
     return Views(images, valid, tuple(view.name for view in views)), canvas_cameras(views, frame)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
 from typing import TypeVar
 
+S = TypeVar("S")
 T = TypeVar("T")
 
 
@@ -25,10 +26,15 @@ class Workers:
 
     def run(self, length: int, step: int, function: Callable[[slice], T]) -> list[T]:
         """Call ``function`` on slices of at most ``step`` that cover ``length``; results in their order."""
-        slices = [slice(first, min(first + step, length)) for first in range(0, length, step)]
-        if self._pool is None or len(slices) < 2:
-            return [function(part) for part in slices]
-        return list(self._pool.map(function, slices))
+        return self.map(
+            function, [slice(first, min(first + step, length)) for first in range(0, length, step)]
+        )
+
+    def map(self, function: Callable[[S], T], items: Sequence[S]) -> list[T]:
+        """Call ``function`` on each item; results in their order."""
+        if self._pool is None or len(items) < 2:
+            return [function(item) for item in items]
+        return list(self._pool.map(function, items))
 
     def __enter__(self) -> Workers:
         return self

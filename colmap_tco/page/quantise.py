@@ -75,10 +75,12 @@ def lossless(codes: NDArray[np.uint8]) -> str:
     """A picture (H, W) or RGB (H, W, 3) as a data URI that decodes to the same numbers."""
     import cv2
 
-    if codes.ndim == 2:
-        return _uri("png", cv2.imencode(".png", codes, [cv2.IMWRITE_PNG_COMPRESSION, 9]))
-    rgb = np.ascontiguousarray(codes[..., ::-1])
-    return _uri("webp", cv2.imencode(".webp", rgb, [cv2.IMWRITE_WEBP_QUALITY, 101]))
+    # What the filters leave of a map is noise almost without repetition: to search for the little there is
+    # takes 20 to 60 times as long, and saves 5 % of a depth map and a fifth of a normal map.
+    options = [cv2.IMWRITE_PNG_COMPRESSION, 6, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+    options += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_ALL_FILTERS]
+    turned = codes if codes.ndim == 2 else np.ascontiguousarray(codes[..., ::-1])
+    return _uri("png", cv2.imencode(".png", turned, options))
 
 
 def photograph(rgb: NDArray[np.uint8]) -> str:

@@ -284,11 +284,11 @@ def test_threads_and_repetition_give_identical_bytes(monkeypatch: pytest.MonkeyP
     """In pieces of 500 pixels and 7 rows, so that the threads really share a view of this size."""
     views = noisy_views(4)
     whole = fused_bytes(views)
-    monkeypatch.setattr("colmap_tco.fusion._RANGE", 500)
+    monkeypatch.setattr("colmap_tco._fusion_reference._RANGE", 500)
     monkeypatch.setattr("colmap_tco._fusion_shelf._ROWS", 7)
     for threads in (1, 2, 5, 5):
         assert fused_bytes(views, replace(CONFIG, num_threads=threads)) == whole
-    monkeypatch.setattr("colmap_tco.fusion._BLOCK", 1000)
+    monkeypatch.setattr("colmap_tco._fusion_reference._BLOCK", 1000)
     assert fused_bytes(views, replace(CONFIG, num_threads=5)) == whole
 
 

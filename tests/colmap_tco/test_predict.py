@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from colmap_tco.backbones import NetworkConfig, load, select
 from colmap_tco.chunks import Chunk
@@ -15,7 +16,15 @@ from colmap_tco.errors import InputError
 from colmap_tco.predict import ChunkResult, corrected_view, predict_chunk
 from colmap_tco.priors import PriorConfig, chunk_frame
 from colmap_tco.tracks import Tracks, read_tracks
-from colmap_tco.views import ChunkFrame, View, ViewConfig, canvas_cameras, make_views
+from colmap_tco.views import (
+    ChunkFrame,
+    Take,
+    View,
+    ViewConfig,
+    canvas_cameras,
+    make_views,
+    undistorted_image,
+)
 from colmap_tco.workspace import open_workspace
 from tco.geometry import so3_exp
 from tco.options import TCOConfig
@@ -38,17 +47,25 @@ def known(room: Room) -> Input:
     return Input(views, read_tracks(workspace.model))
 
 
-def predicted(known: Input, chunk: Chunk, steps: int = 0, holdout: float = 0.2) -> ChunkResult:
+def predicted(
+    known: Input, chunk: Chunk, steps: int = 0, holdout: float = 0.2, take: Take | None = None
+) -> ChunkResult:
     settings = (PriorConfig(holdout=holdout), TCOConfig(steps=steps), 0)
     return predict_chunk(
         (load(select(NetworkConfig(backbone="sweep", device="cpu"))), torch.device("cpu")),
-        known.tracks, known.views, chunk, settings, lambda _: None,
+        known.tracks, known.views, chunk, settings, lambda _: None, take,
     )  # fmt: skip
 
 
 def test_maps_are_in_colmap_units_and_of_the_size_of_the_network_images(known: Input, room: Room) -> None:
-    result = predicted(known, Chunk((1, 3, 4), (2,)))
+    pictures: dict[str, NDArray[np.uint8]] = {}
+    result = predicted(
+        known, Chunk((1, 3, 4), (2,)), take=lambda view, image: pictures.update({view.name: image})
+    )
     assert sorted(result.views) == [known.views[i].name for i in (1, 3, 4)]  # not those of the context
+    assert sorted(pictures) == sorted(result.views)
+    name = known.views[3].name
+    assert (pictures[name] == undistorted_image(known.views[3])[0]).all()
     assert result.history == []
     for index in (1, 3, 4):
         view = known.views[index]

@@ -1,0 +1,223 @@
+"""One reference view of :mod:`colmap_tco.fusion` at a time: votes, means, colours, marks, visibility.
+
+The pixels of the reference are split into ranges. A thread takes a range through all neighbours that are
+in memory together, so that what is noted of its pixels stays in the thread's own cache.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_tco import _fusion_kernels, _merge_kernels, _vote_kernels
+from colmap_tco._fusion_shelf import Shelf, ShelfView
+from colmap_tco.fusion_config import FusionConfig
+from colmap_tco.fusion_input import FusionView, centre, other_from_reference
+from colmap_tco.fusion_report import FusionReport, Tolerance
+from colmap_tco.ply import Cloud, Visibility, join
+
+_BLOCK = 1 << 20
+"""Pixels of a reference that are voted on together; bounds the memory of the votes (some 90 MB)."""
+_RANGE = 64 * _vote_kernels.TILE
+"""Pixels that a thread takes at a time."""
+_COLOR_SAMPLES = 15
+"""Views that a colour is the median of, at most."""
+_FEWEST_VIEWS = 3
+"""Where fewer views than ``min_num_pixels`` can see a point, all of them but at least these must agree."""
+
+Group = list[tuple[int, ShelfView]]
+"""Neighbours that are in memory together, with their slots."""
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A range of M pixels of the reference, and the votes on them.
+
+    Attributes:
+        count: M.
+        tiles: see :mod:`colmap_tco._vote_kernels`.
+        who: (words, at least M) one bit for each neighbour that agrees.
+        failed: (3,) comparisons that failed by depth, reprojection and normal.
+    """
+
+    count: int
+    tiles: _vote_kernels.Tiles
+    who: NDArray[np.uint64]
+    failed: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class _Points:
+    """The K pixels of a part that became points.
+
+    Attributes:
+        part: where they are from.
+        kept: (K,) pixels of the part.
+        supports: (K,) views that agree on each, the reference included.
+        local: (K, 3) in the frame of the reference.
+        points: (K, 3) in the frame of the model.
+        normals: (K, 3) there.
+        samples: (K, S, 3) colours.
+        sampled: (K,) how many of the S are filled.
+        removed: (4,) see :func:`colmap_tco._vote_kernels.accept`.
+    """
+
+    part: _Part
+    kept: NDArray[np.int64]
+    supports: NDArray[np.int64]
+    local: NDArray[np.float32]
+    points: NDArray[np.float64]
+    normals: NDArray[np.float32]
+    samples: NDArray[np.uint8]
+    sampled: NDArray[np.uint8]
+    removed: NDArray[np.int64]
+
+
+class Reference:
+    """A reference view and its neighbours."""
+
+    def __init__(
+        self,
+        shelf: Shelf,
+        views: Sequence[FusionView],
+        position: int,
+        config: FusionConfig,
+        tolerance: Tolerance,
+    ) -> None:
+        self._shelf, self._views, self._position = shelf, views, position
+        self._config, self._tolerance = config, tolerance
+        # A set in ascending order: the result does not depend on the order within the list.
+        self._neighbours = sorted(views[position].neighbours[: config.check_num_images])
+        self._own = shelf.get(position)
+        self._transforms = [other_from_reference(views[n], views[position]) for n in self._neighbours]
+
+    def fuse(self, report: FusionReport) -> Cloud:
+        """The points of the view; ``report`` tells of its pixels."""
+        own = self._own
+        for reason, count in own.dropped.items():
+            report.pixels[reason] += count
+        report.pixels["all"] += own.taken.size
+        pixels = np.empty(own.taken.size, np.int64)
+        found, valid = _fusion_kernels.free(own.packed, own.taken, pixels)
+        report.pixels["already_fused"] += valid - found
+        pixels = pixels[:found]
+        cloud = join(
+            c for first in range(0, found, _BLOCK) for c in self._fuse(pixels[first : first + _BLOCK], report)
+        )
+        if self._config.roi:
+            cloud = self._crop(cloud, report)
+        report.points[self._views[self._position].name] = len(cloud)
+        report.pixels["points"] += len(cloud)
+        return cloud
+
+    def _crop(self, cloud: Cloud, report: FusionReport) -> Cloud:
+        """The points in the region of interest, at the very end, so that the region changes none of them."""
+        low, high = np.array(self._config.roi[:3]), np.array(self._config.roi[3:])
+        inside = np.flatnonzero(((cloud.points >= low) & (cloud.points <= high)).all(1))
+        report.pixels["roi"] += len(cloud) - len(inside)
+        return cloud.select(inside)
+
+    def _fuse(self, pixels: NDArray[np.int64], report: FusionReport) -> list[Cloud]:
+        """The points of these pixels (M,), flat indices into the reference, range by range."""
+        run = self._shelf.workers
+        parts = run.map(
+            self._begin, [pixels[first : first + _RANGE] for first in range(0, len(pixels), _RANGE)]
+        )
+        for group in self._shelf.together(self._position, self._neighbours):
+            run.map(lambda part, group=group: self._vote(part, group), parts)  # type: ignore[misc]
+        merged = run.map(self._merge, parts)
+        for group in self._shelf.together(self._position, self._neighbours):
+            run.map(lambda points, group=group: self._color(points, group), merged)  # type: ignore[misc]
+        _count(report, merged)
+        return run.map(self._finish, merged)
+
+    def _begin(self, pixels: NDArray[np.int64]) -> _Part:
+        tiles = _vote_kernels.tiles_of(len(pixels))
+        _vote_kernels.begin(self._own.packed, pixels, tiles)
+        words = max(1, (len(self._neighbours) + 63) // 64)
+        who = np.zeros((words, len(tiles) * _vote_kernels.TILE), np.uint64)
+        return _Part(len(pixels), tiles, who, np.zeros(3, np.int64))
+
+    def _vote(self, part: _Part, group: Group) -> None:
+        tolerance, config = self._tolerance, self._config
+        cosine = math.cos(math.radians(tolerance.normal))
+        limits = (tolerance.depth, tolerance.reproj, cosine, config.sigma_at_one, config.most_depth_error)
+        for slot, other in group:
+            pair = self._pair(slot, other.camera)
+            _vote_kernels.vote(
+                part.tiles, other.packed, pair, limits, _bit(slot), part.who[slot >> 6], part.failed
+            )
+
+    def _merge(self, part: _Part) -> _Points:
+        """The means at the pixels that have the support that they need."""
+        config, own, view = self._config, self._own, self._views[self._position]
+        fewest = min(config.min_num_pixels, max(2, min(_FEWEST_VIEWS, 1 + len(self._neighbours))))
+        rules = (
+            float(config.min_num_pixels),
+            float(fewest),
+            config.max_conflicts if config.max_conflicts > 0 else math.inf,
+            math.cos(math.radians(config.min_tri_angle)) if config.min_tri_angle > 0 else math.inf,
+        )
+        kept, supports = np.empty(part.count, np.int64), np.empty(part.count, np.int64)
+        removed = np.zeros(4, np.int64)
+        count = _vote_kernels.accept(part.tiles, part.count, rules, kept, supports, removed)
+        kept, supports = kept[:count].copy(), supports[:count].copy()
+        means = np.empty((count, 3), np.float32), np.empty((count, 3)), np.empty((count, 3), np.float32)
+        pose = np.concatenate([view.cam_from_world[:3, :3], centre(view)[None]])
+        _merge_kernels.average(part.tiles, kept, own.camera, pose, means)
+        samples = np.empty((count, min(_COLOR_SAMPLES, 1 + len(self._neighbours)), 3), np.uint8)
+        sampled = np.zeros(count, np.uint8)
+        pair = _fusion_kernels.pair(own.camera, own.image_camera, np.eye(3, 4))
+        _merge_kernels.sample_colors(means[0], np.arange(count), pair, own.image, samples, sampled)
+        return _Points(part, kept, supports, *means, samples, sampled, removed)
+
+    def _color(self, points: _Points, group: Group) -> None:
+        """Sample the colours of a group's images, and mark as taken the pixels that a point is made of."""
+        chosen = np.empty(len(points.kept) + 1, np.int64)
+        for slot, other in group:
+            who = points.part.who[slot >> 6]
+            found = chosen[: _merge_kernels.agreeing(who, points.kept, _bit(slot), chosen)]
+            pair = self._pair(slot, other.image_camera)
+            _merge_kernels.sample_colors(
+                points.local, found, pair, other.image, points.samples, points.sampled
+            )
+            if self._neighbours[slot] < self._position:
+                continue  # it has been the reference, and will not be again
+            pair, error = self._pair(slot, other.camera), self._tolerance.depth
+            _merge_kernels.mark_taken(points.local, found, other.packed, pair, error, other.taken)
+
+    def _finish(self, points: _Points) -> Cloud:
+        """The points with their colours and visibility."""
+        colors = np.empty((len(points.kept), 3), np.uint8)
+        _merge_kernels.median_colors(points.samples, points.sampled, colors)
+        own = self._views[self._position].index
+        theirs = np.array([self._views[p].index for p in self._neighbours], np.uint32)
+        start = np.concatenate([[0], points.supports]).cumsum()
+        images = np.empty(start[-1], np.uint32)
+        order, before = np.argsort(theirs, kind="stable"), int((theirs < own).sum())
+        _merge_kernels.list_views(points.part.who, points.kept, order, theirs, (before, own), images)
+        return Cloud(points.points, points.normals, colors, Visibility(start, images))
+
+    def _pair(self, slot: int, camera: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The reference and the neighbour in this slot, of which ``camera`` is the map's or the image's."""
+        return _fusion_kernels.pair(self._own.camera, camera, self._transforms[slot])
+
+
+def _bit(slot: int) -> np.uint64:
+    """The bit of a neighbour in its word."""
+    return np.uint64(1) << np.uint64(slot & 63)
+
+
+def _count(report: FusionReport, merged: Sequence[_Points]) -> None:
+    """Add up what became of the pixels of a block."""
+    failed = np.sum([np.zeros(3, np.int64), *(points.part.failed for points in merged)], 0)
+    for name, number in zip(report.comparisons, failed.tolist(), strict=True):
+        report.comparisons[name] += number
+    removed = np.sum([np.zeros(4, np.int64), *(points.removed for points in merged)], 0).tolist()
+    for name, number in zip(("max_conflicts", "min_num_pixels", "min_tri_angle"), removed, strict=False):
+        report.pixels[name] += number
+    report.lowered += removed[3]
