@@ -229,8 +229,12 @@ def load(selected: Selected) -> Backbone:
     return backbone
 
 
-def suited(config: TCOConfig, network: Network) -> TCOConfig:
-    """The settings of optimisation, with the network's own where the user left the defaults."""
+def suited(config: TCOConfig, network: Network, given: Sequence[str] = ()) -> TCOConfig:
+    """The settings of optimisation, with the network's own where the user left the defaults.
+
+    Settings named in ``given`` stay in any case: the user asked for what happens to be the default.
+    """
     default = TCOConfig()
     untouched = {f.name for f in fields(TCOConfig) if getattr(config, f.name) == getattr(default, f.name)}
-    return replace(config, **{name: value for name, value in network.tco.items() if name in untouched})
+    own = network.tco.items()
+    return replace(config, **{name: value for name, value in own if name in untouched.difference(given)})

@@ -23,6 +23,7 @@ from colmap_tco.backbones import Budget, NetworkConfig, Selected, load, select, 
 from colmap_tco.chunks import Chunk, ChunkPlan, plan_chunks, source_views
 from colmap_tco.errors import InputError, OutOfMemoryError, PartlyDoneError
 from colmap_tco.fill import Existing, FillConfig, fill, open_existing
+from colmap_tco.flags import given_flags
 from colmap_tco.fusion import EmptyCloudError, FusionConfig, fuse
 from colmap_tco.lock import locked
 from colmap_tco.mapping import MappingConfig, ensure_model
@@ -61,6 +62,7 @@ class DensifyConfig:
     fill: FillConfig = field(default_factory=FillConfig)
     workspace: WorkspaceConfig = field(default_factory=WorkspaceConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
+    given: tuple[str, ...] = given_flags()
 
     @property
     def num_threads(self) -> int:
@@ -135,7 +137,7 @@ def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified
     with clock("workspace"):
         progress.stage("workspace", 1)
         chosen = select(config.network)
-        config = dataclasses.replace(config, tco=suited(config.tco, chosen.network))
+        config = dataclasses.replace(config, tco=suited(config.tco, chosen.network, config.given))
         workspace = _open_or_map(root, config)
         views, skipped = make_views(workspace, config.views, chosen.network.stride, chosen.network.image_size)
         tracks = read_tracks(workspace.model)
@@ -238,7 +240,11 @@ def _fingerprints(
 ) -> tuple[str, str]:
     """Two texts: one changes with everything that decides the result, one with what decides the maps."""
     kept = dataclasses.replace(
-        config, overwrite=False, report_page=True, fusion=dataclasses.replace(config.fusion, num_threads=-1)
+        config,
+        overwrite=False,
+        report_page=True,
+        given=(),
+        fusion=dataclasses.replace(config.fusion, num_threads=-1),
     )
     mapped = dataclasses.replace(kept, refine_cameras=False, fusion=FusionConfig())
     masks = [view.mask_path for view in views if view.mask_path is not None]

@@ -185,3 +185,6 @@ def test_the_networks_own_settings_hold_where_the_user_gave_none() -> None:
     mine = suited(TCOConfig(rate=3e-3, steps=7), vggt)
     assert mine.rate == 3e-3 and mine.steps == 7
     assert mine.lora_targets == ("qkv", "proj", "fc1", "fc2")
+    asked = suited(TCOConfig(), vggt, given=("rate", "steps"))
+    assert asked.rate == TCOConfig().rate != 5e-4
+    assert asked.lora_targets == mine.lora_targets
