@@ -5,8 +5,8 @@
 COLMAP's PatchMatch needs CUDA. Here its place is taken by the one of pyarchinit-photogrammetry-core (PyPI;
 ``--no-deps`` is enough), at half resolution, on the images and cameras that COLMAP's ``image_undistorter``
 writes; its maps are filtered as ``patch_match_stereo`` does with ``geom_consistency`` (a depth stays if at
-least two other views lead back to its pixel within one pixel) and written in COLMAP's formats. What follows is
-the command that a user would give.
+least two other views lead back to its pixel within one pixel) and written in COLMAP's formats. What follows
+is the command that a user would give.
 """
 
 from __future__ import annotations

@@ -187,10 +187,13 @@ def _best(device: torch.device) -> tuple[Network, str]:
     ready = [name for name in fetched if not NETWORKS[name].missing()]
     sweep = NETWORKS["sweep"]
     if not ready:
-        return sweep, (
-            f"auto: no weights of {' or '.join(PUBLISHED)} were fetched with their licence accepted, or what "
-            "they run from is not installed"
-        )
+        there = [name for name in PUBLISHED if cached(PUBLISHED[name][1])]
+        if there:
+            return sweep, (
+                f"auto: weights of {' and '.join(there)} are there, but their licence was not accepted, or "
+                "what they run from is not installed; colmap-tco weights list says which"
+            )
+        return sweep, "auto: no weights of a larger network were fetched; colmap-tco weights list shows them"
     if device.type != "cuda":
         return sweep, (
             f"auto: {' and '.join(ready)} could run, but take long without a CUDA device; "
@@ -220,11 +223,10 @@ def load(selected: Selected) -> Backbone:
         backbone = loader(selected.weights, device=selected.device)
     except WeightsError as error:
         raise MissingError(str(error)) from error
-    log.info(
-        "network %s (%s), weights %s; %s", network.name, network.title, selected.weights, selected.reason
-    )
+    log.info("network %s (%s); %s", network.name, network.title, selected.reason)
     if network.checkpoint is not None:
         c = network.checkpoint
+        log.info("its weights are %s", selected.weights)
         log.info("its weights are licensed %s: %s; %s", c.licence, c.terms, c.licence_url)
     return backbone
 

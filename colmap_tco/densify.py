@@ -100,8 +100,8 @@ class Densified:
         quality = "no point was held out"
         if held["points"]:
             quality = (
-                f"{100 * held['within_5_percent']:.1f} % of {held['points']} held-out points within 5 % "
-                f"(median error {100 * held['median_error']:.2f} %)"
+                f"{100 * held['within_5_percent']:.1f} % of {held['points']} depths at held-out points "
+                f"within 5 % (median error {100 * held['median_error']:.2f} %)"
             )
         return (
             f"{self.folder / 'fused.ply'}: {r['points']} points from {r['images']['used']} views, {state}\n"
@@ -109,10 +109,13 @@ class Densified:
         )
 
 
-def densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified:
+def densify(
+    root: Path, config: DensifyConfig = DensifyConfig(), progress: Progress | None = None
+) -> Densified:
     """Make depth maps, normal maps and a fused cloud of a workspace, in ``<root>/dense-tco/``.
 
-    Nothing that the user had is changed; an interrupted run is continued by the next.
+    Nothing that the user had is changed; an interrupted run is continued by the next. Without a ``progress``,
+    that is logged.
 
     Raises:
         InputError: images, model or masks that cannot be used, a result with other settings is there, or
@@ -123,7 +126,7 @@ def densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified:
     """
     root = existing_root(root)
     with locked(root):
-        done = _densify(root, config, progress)
+        done = _densify(root, config, progress or Progress())
     doubts = done.doubts()
     if doubts:
         raise PartlyDoneError("\n".join([done.summary(), *doubts]))
@@ -140,7 +143,7 @@ def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified
         config = dataclasses.replace(config, tco=suited(config.tco, chosen.network, config.given))
         workspace = _open_or_map(root, config)
         views, skipped = make_views(workspace, config.views, chosen.network.stride, chosen.network.image_size)
-        tracks = read_tracks(workspace.model)
+        tracks = read_tracks(workspace.model, logging.INFO)
         views, blind = with_points(tracks, views, config.priors, config.seed)
         pairs = covisibility(tracks, [view.image_id for view in views])
         budget = Budget.of(chosen, views, config.network, config.tco.steps)

@@ -66,7 +66,9 @@ class Exported:
         return f"{self.path}: {self.told}"
 
 
-def export(format: str, root: Path, config: ExportConfig, progress: Progress) -> Exported:
+def export(
+    format: str, root: Path, config: ExportConfig = ExportConfig(), progress: Progress | None = None
+) -> Exported:
     """Write the dense workspace of ``root`` in one of :data:`FORMATS`.
 
     The files appear complete or not at all.
@@ -76,6 +78,7 @@ def export(format: str, root: Path, config: ExportConfig, progress: Progress) ->
         MissingError: a package that the format needs is not installed.
     """
     dense = open_dense(root)
+    progress = progress or Progress()
     progress.stage(f"export {format}", 1)
     if format == "las":
         from colmap_tco.export.las import write_las
