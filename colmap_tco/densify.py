@@ -150,7 +150,7 @@ def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified
         plan = plan_chunks(pairs.common, budget.views())
         existing = _existing(config, views)
         key, maps = _fingerprints(workspace, views, config, chosen, existing)
-        result = open_result(root, key, config.overwrite, maps)
+        result = open_result(root, key, config.overwrite, maps, outputs.plain(config))
     if result.finished:
         return Densified(result.paths.root, json.loads(result.paths.report.read_text("utf-8")), fresh=False)
     alone = {views[i].name: why for i, why in plan.skipped.items()}

@@ -25,7 +25,7 @@ from colmap_tco.scene import Scene, open_scene
 from colmap_tco.views import View, ViewConfig, canvas_size, crop, original_from_network
 from tco.backbones.weights import load_sweep
 from tco.optimize import Outcome, errors_at_points, optimize
-from tco.options import TCOConfig
+from tco.options import PolishConfig, TCOConfig
 from tco.types import Priors
 
 
@@ -71,7 +71,9 @@ def with_depth(
 
 def adapt(scene: Scene, priors: Priors, steps: int) -> Outcome:
     """The embedded network, optimised with the weight of the depths if there are any."""
-    config = TCOConfig(steps=steps, depth_weight=0.03 if priors.depth is not None else 0.0)
+    # A sensor knows more of each pixel than the colours do: larger steps on the depths themselves, and more.
+    polish = PolishConfig(polish_steps=40, polish_rate=3e-3)
+    config = TCOConfig(steps=steps, depth_weight=0.1 if priors.depth is not None else 0.0, polish=polish)
     return optimize(load_sweep(), scene.views, priors, config)
 
 

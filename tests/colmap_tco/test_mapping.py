@@ -172,7 +172,7 @@ def test_the_database_is_only_read(mapped: Path) -> None:
 
 
 def test_the_folder_of_pictures_of_a_workspace_is_no_workspace(mapped: Path) -> None:
-    """It was meant to be the folder above; nothing is mapped anew, and nothing written beside the pictures."""
+    """The folder above was meant; nothing is mapped anew, and nothing written beside the pictures."""
     before = sorted((mapped / "images").rglob("*"))
     with pytest.raises(InputError, match=f"colmap-tco densify {mapped}$"):
         ensure_model(mapped / "images", num_threads=1)
