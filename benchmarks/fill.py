@@ -12,6 +12,7 @@ is the command that a user would give.
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
@@ -154,6 +155,10 @@ def main() -> None:
     parser.add_argument("set", choices=SETS)
     parser.add_argument("--work", type=Path, default=Path("runs/fill"))
     args, rest = parser.parse_known_args()
+    if importlib.util.find_spec("ppg_core") is None:
+        sys.exit(
+            "pip install --no-deps pyarchinit-photogrammetry-core==0.5.0 brings the PatchMatch that this runs"
+        )
     args.work.mkdir(parents=True, exist_ok=True)
     root, dense = copied(args.set, args.work), args.work / f"{args.set}-patchmatch"
     if not dense.exists():

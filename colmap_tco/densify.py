@@ -44,7 +44,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class DensifyConfig:
-    """Everything that ``colmap-tco densify`` can be told."""
+    """Everything that ``colmap-tco densify`` can be told.
+
+    What is in ``given`` stands where the network has settings of its own in place of the defaults.
+    """
 
     seed: int = knob(0, "seed of all randomness; the same seed, inputs and machine give the same result")
     overwrite: bool = knob(False, "replace an earlier result that was made with other settings")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from colmap_tco import flags
 from colmap_tco.backbones import NetworkConfig, Selected, _best, choose_device, load, select, suited
+from colmap_tco.densify import DensifyConfig
 from colmap_tco.errors import MissingError
 from colmap_tco.published import NETWORKS, PUBLISHED
 from colmap_tco.weights import _note_accepted, cached
@@ -176,6 +179,16 @@ def test_the_registry_agrees_with_the_networks(tmp_path: Path) -> None:
         assert backbone.stride == network.stride and backbone.name == network.kind
         config = suited(TCOConfig(), network)
         assert layers(backbone.decoder(), config.lora_targets)
+
+
+def test_a_default_that_the_command_line_names_stands() -> None:
+    parser = argparse.ArgumentParser()
+    flags.add_flags(parser, DensifyConfig)
+    config = flags.build(DensifyConfig, parser.parse_args(["--rate", str(TCOConfig().rate)]))
+    assert config.given == ("rate",) and config.tco == TCOConfig()
+    vggt = suited(config.tco, NETWORKS["vggt"], config.given)
+    assert vggt.rate == TCOConfig().rate
+    assert vggt.lora_targets == NETWORKS["vggt"].tco["lora_targets"] != TCOConfig().lora_targets
 
 
 def test_the_networks_own_settings_hold_where_the_user_gave_none() -> None:
