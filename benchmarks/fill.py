@@ -156,9 +156,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=Path("runs/fill"))
     args, rest = parser.parse_known_args()
     if importlib.util.find_spec("ppg_core") is None:
-        sys.exit(
-            "pip install --no-deps pyarchinit-photogrammetry-core==0.5.0 brings the PatchMatch that this runs"
-        )
+        sys.exit("this needs a PatchMatch: pip install --no-deps pyarchinit-photogrammetry-core==0.5.0")
     args.work.mkdir(parents=True, exist_ok=True)
     root, dense = copied(args.set, args.work), args.work / f"{args.set}-patchmatch"
     if not dense.exists():

@@ -70,10 +70,12 @@ def with_depth(
 
 
 def adapt(scene: Scene, priors: Priors, steps: int) -> Outcome:
-    """The embedded network, optimised with the weight of the depths if there are any."""
-    # A sensor knows more of each pixel than the colours do: larger steps on the depths themselves, and more.
-    polish = PolishConfig(polish_steps=40, polish_rate=3e-3)
-    config = TCOConfig(steps=steps, depth_weight=0.1 if priors.depth is not None else 0.0, polish=polish)
+    """The embedded network, optimised with the sensor's depths where these are among the priors."""
+    config = TCOConfig(steps=steps)
+    if priors.depth is not None:
+        # A sensor knows more of each pixel than colours do: more steps on the depths themselves, and larger ones.
+        polish = PolishConfig(polish_steps=60, polish_rate=1.5e-3)
+        config = TCOConfig(steps=steps, depth_weight=0.1, polish=polish)
     return optimize(load_sweep(), scene.views, priors, config)
 
 
