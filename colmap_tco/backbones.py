@@ -187,12 +187,11 @@ def _best(device: torch.device) -> tuple[Network, str]:
     ready = [name for name in fetched if not NETWORKS[name].missing()]
     sweep = NETWORKS["sweep"]
     if not ready:
-        there = [name for name in PUBLISHED if cached(PUBLISHED[name][1])]
-        if there:
-            return sweep, (
-                f"auto: weights of {' and '.join(there)} are there, but their licence was not accepted, or "
-                "what they run from is not installed; colmap-tco weights list says which"
-            )
+        there = [NETWORKS[name] for name in PUBLISHED if cached(PUBLISHED[name][1])]
+        why = [f"the licence of {n.name}'s weights was not accepted" for n in there if not accepted(n)]
+        why += [f"{n.name} needs {', '.join(n.missing())}, not installed" for n in there if n.missing()]
+        if why:
+            return sweep, f"auto: {'; '.join(why)}; colmap-tco weights list says more"
         return sweep, "auto: no weights of a larger network were fetched; colmap-tco weights list shows them"
     if device.type != "cuda":
         return sweep, (

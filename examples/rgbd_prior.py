@@ -73,7 +73,7 @@ def adapt(scene: Scene, priors: Priors, steps: int) -> Outcome:
     """The embedded network, optimised with the sensor's depths where these are among the priors."""
     config = TCOConfig(steps=steps)
     if priors.depth is not None:
-        # A sensor knows more of each pixel than colours do: more steps on the depths themselves, and larger ones.
+        # A sensor knows more of each pixel than colours do: more and larger steps on the depths themselves.
         polish = PolishConfig(polish_steps=60, polish_rate=1.5e-3)
         config = TCOConfig(steps=steps, depth_weight=0.1, polish=polish)
     return optimize(load_sweep(), scene.views, priors, config)
