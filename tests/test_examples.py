@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import cv2
 import numpy as np
@@ -186,19 +188,28 @@ def test_the_dominant_plane_is_found_among_other_points() -> None:
     np.testing.assert_allclose(np.abs(plane), [0, 0, 1, 3], atol=1e-9)
 
 
+UNIT, METRES = 0.0005, 0.3
+"""Metres of a step of the sensor, and of a unit of the room's model."""
+
+
+def write_sensor(room: Room, folder: Path) -> None:
+    """Depths of every other stripe of the pictures, with the noise of a Kinect."""
+    rng = np.random.default_rng(0)
+    for name, depth in zip(room.names, room.sample.depth, strict=True):
+        there = METRES * depth
+        sigma = rgbd_prior.kinect(torch.from_numpy(there)).numpy()
+        measured = np.rint((there + sigma * rng.normal(size=depth.shape)) / UNIT)
+        measured[:, (np.arange(depth.shape[1]) // 20) % 2 == 0] = 0
+        cv2.imwrite(str(folder / f"{Path(name).stem}.png"), measured.astype(np.uint16))
+
+
 def test_rgbd_prior_brings_its_scale_and_its_accuracy(
     scene: Scene, truth: Tensor, room: Room, tmp_path: Path
 ) -> None:
-    """Noisy depths of every other stripe of the pictures, in units that COLMAP does not know."""
-    unit, metres, rng = 0.0005, 0.3, np.random.default_rng(0)
-    for name, depth in zip(room.names, room.sample.depth, strict=True):
-        there = metres * depth
-        sigma = rgbd_prior.kinect(torch.from_numpy(there)).numpy()
-        measured = np.rint((there + sigma * rng.normal(size=depth.shape)) / unit)
-        measured[:, (np.arange(depth.shape[1]) // 20) % 2 == 0] = 0
-        cv2.imwrite(str(tmp_path / f"{Path(name).stem}.png"), measured.astype(np.uint16))
-    known, found = rgbd_prior.with_depth(scene, tmp_path, unit)
-    assert found == pytest.approx(metres, rel=0.005)
+    """In metres, which COLMAP does not know; and where the sensor saw nothing it does no harm."""
+    write_sensor(room, tmp_path)
+    known, found = rgbd_prior.with_depth(scene, tmp_path, UNIT)
+    assert found == pytest.approx(METRES, rel=0.005)
     assert known.depth is not None and known.depth_sigma is not None
     there = known.depth > 0
     assert 0.4 < float(there.float().mean()) < 0.6
@@ -208,3 +219,32 @@ def test_rgbd_prior_brings_its_scale_and_its_accuracy(
     assert error(with_them, truth, there) < 0.7 * error(without, truth, there)
     assert error(with_them, truth, ~there) < 1.05 * error(without, truth, ~there)
     assert error(with_them, truth) < 0.8 * error(without, truth)
+
+
+def printed(
+    example: ModuleType, words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> str:
+    """What an example's command line prints, without optimisation, in this process."""
+    monkeypatch.setattr(sys, "argv", [example.__name__, *words, "--size", str(SIZE), "--steps", "0"])
+    example.main()
+    return capsys.readouterr().out
+
+
+def test_command_lines_say_what_the_examples_found(
+    room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = str(room.root)
+    told = printed(python_api, [root, "-o", str(tmp_path / "c.ply")], monkeypatch, capsys)
+    assert f"c.ply: {len(read_ply(tmp_path / 'c.ply')[0])} points" in told
+    told = printed(custom_prior, [root], monkeypatch, capsys)
+    plane = re.search(r"plane of COLMAP's points: (\S+)", told)
+    assert plane is not None
+    found = np.array([float(word) for word in plane[1].split(",")])
+    np.testing.assert_allclose(found * np.sign(found[1]), [0, 1, 0, -2], atol=1e-4)
+    told = printed(custom_backbone, [root], monkeypatch, capsys)
+    errors = re.findall(r"0 steps: median error at held-out points (\S+)%", told)
+    assert len(errors) == 2 and errors[0] == errors[1] and float(errors[0]) < 10
+    write_sensor(room, tmp_path)
+    told = printed(rgbd_prior, [root, str(tmp_path), "--unit", str(UNIT)], monkeypatch, capsys)
+    metres = re.search(r"one COLMAP unit is (\S+) m", told)
+    assert metres is not None and float(metres[1]) == pytest.approx(METRES, rel=0.005)
