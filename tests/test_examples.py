@@ -64,9 +64,10 @@ def scene(room: Room) -> Scene:
 @pytest.fixture(scope="module")
 def truth(scene: Scene, room: Room) -> Tensor:
     """Depth (V, H, W) of the room in the units of the scene, 0 where there is none."""
-    h, w = scene.views.size
-    small = [cv2.resize(depth, (w, h), interpolation=cv2.INTER_NEAREST) for depth in room.sample.depth]
-    return torch.from_numpy(np.stack(small)) / scene.frame.scale
+    (h, w), (tall, wide) = scene.views.size, room.sample.depth.shape[1:]
+    # The original pixel in which the centre of a network's pixel is.
+    y, x = np.ix_((np.arange(h) + 0.5) * tall // h, (np.arange(w) + 0.5) * wide // w)
+    return torch.from_numpy(room.sample.depth[:, y.astype(int), x.astype(int)]) / scene.frame.scale
 
 
 def error(prediction: Prediction, truth: Tensor, where: Tensor | None = None) -> float:
