@@ -187,12 +187,7 @@ def _best(device: torch.device) -> tuple[Network, str]:
     ready = [name for name in fetched if not NETWORKS[name].missing()]
     sweep = NETWORKS["sweep"]
     if not ready:
-        there = [NETWORKS[name] for name in PUBLISHED if cached(PUBLISHED[name][1])]
-        why = [f"the licence of {n.name}'s weights was not accepted" for n in there if not accepted(n)]
-        why += [f"{n.name} needs {', '.join(n.missing())}, not installed" for n in there if n.missing()]
-        if why:
-            return sweep, f"auto: {'; '.join(why)}; colmap-tco weights list says more"
-        return sweep, "auto: no weights of a larger network were fetched; colmap-tco weights list shows them"
+        return sweep, _why_none()
     if device.type != "cuda":
         return sweep, (
             f"auto: {' and '.join(ready)} could run, but take long without a CUDA device; "
@@ -205,6 +200,16 @@ def _best(device: torch.device) -> tuple[Network, str]:
         if need < free:
             return network, f"auto: fetched, and {gigabytes(free)} of {device} are enough for it"
     return sweep, f"auto: {gigabytes(free)} free on {device} are too little for {' or '.join(ready)}"
+
+
+def _why_none() -> str:
+    """Why no published network is ready to run."""
+    there = [NETWORKS[name] for name, (_, checkpoint) in PUBLISHED.items() if cached(checkpoint)]
+    why = [f"the licence of {n.name}'s weights was not accepted" for n in there if not accepted(n)]
+    why += [f"{n.name} needs {', '.join(n.missing())}, not installed" for n in there if n.missing()]
+    if why:
+        return f"auto: {'; '.join(why)}; colmap-tco weights list says more"
+    return "auto: no weights of a larger network were fetched; colmap-tco weights list shows them"
 
 
 def load(selected: Selected) -> Backbone:
