@@ -187,10 +187,7 @@ def _best(device: torch.device) -> tuple[Network, str]:
     ready = [name for name in fetched if not NETWORKS[name].missing()]
     sweep = NETWORKS["sweep"]
     if not ready:
-        return sweep, (
-            f"auto: no weights of {' or '.join(PUBLISHED)} were fetched with their licence accepted, or what "
-            "they run from is not installed"
-        )
+        return sweep, _why_none()
     if device.type != "cuda":
         return sweep, (
             f"auto: {' and '.join(ready)} could run, but take long without a CUDA device; "
@@ -203,6 +200,16 @@ def _best(device: torch.device) -> tuple[Network, str]:
         if need < free:
             return network, f"auto: fetched, and {gigabytes(free)} of {device} are enough for it"
     return sweep, f"auto: {gigabytes(free)} free on {device} are too little for {' or '.join(ready)}"
+
+
+def _why_none() -> str:
+    """Why no published network is ready to run."""
+    there = [NETWORKS[name] for name, (_, checkpoint) in PUBLISHED.items() if cached(checkpoint)]
+    why = [f"the licence of {n.name}'s weights was not accepted" for n in there if not accepted(n)]
+    why += [f"{n.name} needs {', '.join(n.missing())}, not installed" for n in there if n.missing()]
+    if why:
+        return f"auto: {'; '.join(why)}; colmap-tco weights list says more"
+    return "auto: no weights of a larger network were fetched; colmap-tco weights list shows them"
 
 
 def load(selected: Selected) -> Backbone:
@@ -220,17 +227,20 @@ def load(selected: Selected) -> Backbone:
         backbone = loader(selected.weights, device=selected.device)
     except WeightsError as error:
         raise MissingError(str(error)) from error
-    log.info(
-        "network %s (%s), weights %s; %s", network.name, network.title, selected.weights, selected.reason
-    )
+    log.info("network %s (%s); %s", network.name, network.title, selected.reason)
     if network.checkpoint is not None:
         c = network.checkpoint
+        log.info("its weights are %s", selected.weights)
         log.info("its weights are licensed %s: %s; %s", c.licence, c.terms, c.licence_url)
     return backbone
 
 
-def suited(config: TCOConfig, network: Network) -> TCOConfig:
-    """The settings of optimisation, with the network's own where the user left the defaults."""
+def suited(config: TCOConfig, network: Network, given: Sequence[str] = ()) -> TCOConfig:
+    """The settings of optimisation, with the network's own where the user left the defaults.
+
+    Settings named in ``given`` stay in any case: the user asked for what happens to be the default.
+    """
     default = TCOConfig()
     untouched = {f.name for f in fields(TCOConfig) if getattr(config, f.name) == getattr(default, f.name)}
-    return replace(config, **{name: value for name, value in network.tco.items() if name in untouched})
+    own = network.tco.items()
+    return replace(config, **{name: value for name, value in own if name in untouched.difference(given)})

@@ -23,6 +23,7 @@ from colmap_tco.backbones import Budget, NetworkConfig, Selected, load, select, 
 from colmap_tco.chunks import Chunk, ChunkPlan, plan_chunks, source_views
 from colmap_tco.errors import InputError, OutOfMemoryError, PartlyDoneError
 from colmap_tco.fill import Existing, FillConfig, fill, open_existing
+from colmap_tco.flags import given_flags
 from colmap_tco.fusion import EmptyCloudError, FusionConfig, fuse
 from colmap_tco.lock import locked
 from colmap_tco.mapping import MappingConfig, ensure_model
@@ -43,7 +44,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class DensifyConfig:
-    """Everything that ``colmap-tco densify`` can be told."""
+    """Everything that ``colmap-tco densify`` can be told.
+
+    What is in ``given`` stands where the network has settings of its own in place of the defaults.
+    """
 
     seed: int = knob(0, "seed of all randomness; the same seed, inputs and machine give the same result")
     overwrite: bool = knob(False, "replace an earlier result that was made with other settings")
@@ -61,6 +65,7 @@ class DensifyConfig:
     fill: FillConfig = field(default_factory=FillConfig)
     workspace: WorkspaceConfig = field(default_factory=WorkspaceConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
+    given: tuple[str, ...] = given_flags()
 
     @property
     def num_threads(self) -> int:
@@ -98,8 +103,8 @@ class Densified:
         quality = "no point was held out"
         if held["points"]:
             quality = (
-                f"{100 * held['within_5_percent']:.1f} % of {held['points']} held-out points within 5 % "
-                f"(median error {100 * held['median_error']:.2f} %)"
+                f"{100 * held['within_5_percent']:.1f} % of {held['points']} depths at held-out points "
+                f"within 5 % (median error {100 * held['median_error']:.2f} %)"
             )
         return (
             f"{self.folder / 'fused.ply'}: {r['points']} points from {r['images']['used']} views, {state}\n"
@@ -107,10 +112,13 @@ class Densified:
         )
 
 
-def densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified:
+def densify(
+    root: Path, config: DensifyConfig = DensifyConfig(), progress: Progress | None = None
+) -> Densified:
     """Make depth maps, normal maps and a fused cloud of a workspace, in ``<root>/dense-tco/``.
 
-    Nothing that the user had is changed; an interrupted run is continued by the next.
+    Nothing that the user had is changed; an interrupted run is continued by the next. Without a ``progress``,
+    that is logged.
 
     Raises:
         InputError: images, model or masks that cannot be used, a result with other settings is there, or
@@ -121,7 +129,7 @@ def densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified:
     """
     root = existing_root(root)
     with locked(root):
-        done = _densify(root, config, progress)
+        done = _densify(root, config, progress or Progress())
     doubts = done.doubts()
     if doubts:
         raise PartlyDoneError("\n".join([done.summary(), *doubts]))
@@ -135,17 +143,17 @@ def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified
     with clock("workspace"):
         progress.stage("workspace", 1)
         chosen = select(config.network)
-        config = dataclasses.replace(config, tco=suited(config.tco, chosen.network))
+        config = dataclasses.replace(config, tco=suited(config.tco, chosen.network, config.given))
         workspace = _open_or_map(root, config)
         views, skipped = make_views(workspace, config.views, chosen.network.stride, chosen.network.image_size)
-        tracks = read_tracks(workspace.model)
+        tracks = read_tracks(workspace.model, logging.INFO)
         views, blind = with_points(tracks, views, config.priors, config.seed)
         pairs = covisibility(tracks, [view.image_id for view in views])
         budget = Budget.of(chosen, views, config.network, config.tco.steps)
         plan = plan_chunks(pairs.common, budget.views())
         existing = _existing(config, views)
         key, maps = _fingerprints(workspace, views, config, chosen, existing)
-        result = open_result(root, key, config.overwrite, maps)
+        result = open_result(root, key, config.overwrite, maps, outputs.plain(config))
     if result.finished:
         return Densified(result.paths.root, json.loads(result.paths.report.read_text("utf-8")), fresh=False)
     alone = {views[i].name: why for i, why in plan.skipped.items()}
@@ -238,7 +246,11 @@ def _fingerprints(
 ) -> tuple[str, str]:
     """Two texts: one changes with everything that decides the result, one with what decides the maps."""
     kept = dataclasses.replace(
-        config, overwrite=False, report_page=True, fusion=dataclasses.replace(config.fusion, num_threads=-1)
+        config,
+        overwrite=False,
+        report_page=True,
+        given=(),
+        fusion=dataclasses.replace(config.fusion, num_threads=-1),
     )
     mapped = dataclasses.replace(kept, refine_cameras=False, fusion=FusionConfig())
     masks = [view.mask_path for view in views if view.mask_path is not None]

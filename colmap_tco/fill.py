@@ -22,7 +22,7 @@ from colmap_tco.errors import InputError
 from colmap_tco.maps import map_intrinsics, read_map
 from colmap_tco.outputs import ViewMaps
 from colmap_tco.pinhole import Pinhole
-from colmap_tco.views import View
+from colmap_tco.views import View, map_mask
 from colmap_tco.workspace import DensePaths
 from tco.config import knob
 
@@ -110,7 +110,7 @@ def fill(existing: Existing, view: View, maps: ViewMaps) -> tuple[ViewMaps, dict
     """The maps of a view with the existing depths kept, and how many pixels are kept and filled.
 
     The result has the resolution of the finer of the two, at most that of the undistorted image; a view
-    without an existing map comes back as it is.
+    without an existing map comes back as it is. What its mask excludes is neither kept nor filled.
 
     Raises:
         InputError: a map is damaged, or the two of a view differ in size.
@@ -131,13 +131,16 @@ def fill(existing: Existing, view: View, maps: ViewMaps) -> tuple[ViewMaps, dict
     kept = _resampled((depth, normal), theirs, rays)
     confidence = np.ones(shape, np.float32)
     confidence[ours.found] = maps.confidence[ours.row[ours.found], ours.col[ours.found]]
-    take = kept.found
+    take, mask = kept.found, map_mask(view, shape)
     confidence[take] = existing.confidence
     merged = ViewMaps(
         np.where(take, kept.depth, ours.depth),
         np.where(take[..., None], kept.normal, ours.normal),
         confidence,
     )
+    if mask is not None:
+        take &= mask
+        merged.depth[~mask], merged.normal[~mask], merged.confidence[~mask] = 0, 0, 1
     return merged, _counts(int(take.sum()), merged.depth)
 
 

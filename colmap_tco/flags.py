@@ -5,6 +5,8 @@ dataclass declares it, and a name declared twice is an error. The types understo
 ``float``, ``bool`` (``--name`` and ``--no_name``), ``str`` with or without choices, ``Path``,
 ``Optional`` of these (the word ``none`` stands for None) and ``tuple[…, ...]`` of these (separated
 by commas, so that no value may hold one).
+
+A field made with ``given_flags`` is no setting: it holds the names of those that the command line gave.
 """
 
 from __future__ import annotations
@@ -14,8 +16,8 @@ import difflib
 import math
 import re
 import types
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -104,6 +106,15 @@ class _Switch(argparse.Action):
         setattr(namespace, self.dest, option_string == self.option_strings[0])
 
 
+def given_flags() -> tuple[str, ...]:
+    """A field for the names of the settings that a command line gave, their defaults or not; else empty."""
+    names: tuple[str, ...] = field(default=(), metadata={_GIVEN: True})
+    return names
+
+
+_GIVEN = "names of the flags that were given"
+
+
 def settings(config_type: type) -> tuple[Setting, ...]:
     """All settings of a dataclass and of the dataclasses nested in it, in order.
 
@@ -129,7 +140,7 @@ def settings(config_type: type) -> tuple[Setting, ...]:
 
 
 def add_flags(parser: argparse.ArgumentParser, config_type: type) -> None:
-    """Add a flag for every setting, one titled group for every dataclass.
+    """Add a flag for every setting, one titled group for every dataclass; one not given sets nothing.
 
     Raises:
         TypeError, ValueError: as :func:`settings`.
@@ -142,14 +153,19 @@ def add_flags(parser: argparse.ArgumentParser, config_type: type) -> None:
         text = f"{setting.help} (default: {default})".replace("%", "%%")
         if setting.base is bool:
             groups[setting.owner].add_argument(
-                *setting.flags, dest=setting.name, action=_Switch, nargs=0, default=setting.default, help=text
+                *setting.flags,
+                dest=setting.name,
+                action=_Switch,
+                nargs=0,
+                default=argparse.SUPPRESS,
+                help=text,
             )
         else:
             groups[setting.owner].add_argument(
                 *setting.flags,
                 dest=setting.name,
                 type=setting.parse,
-                default=setting.default,
+                default=argparse.SUPPRESS,
                 metavar=_metavar(setting),
                 help=text,
             )
@@ -157,14 +173,23 @@ def add_flags(parser: argparse.ArgumentParser, config_type: type) -> None:
 
 def build(config_type: type[T], namespace: argparse.Namespace) -> T:
     """The configuration, nested dataclasses included, that a parsed command line describes."""
-    hints = get_type_hints(config_type)
-    values = {
-        field.name: build(hints[field.name], namespace)
-        if is_dataclass(hints[field.name])
-        else getattr(namespace, field.name)
-        for field in fields(config_type)  # type: ignore[arg-type]
-    }
-    return config_type(**values)
+    names = {setting.name for setting in settings(config_type)}
+    given = {name: value for name, value in vars(namespace).items() if name in names}
+    return _changed(config_type(), given)
+
+
+def _changed(config: T, given: Mapping[str, Any]) -> T:
+    """The configuration with the settings that were given, and their names where it has a field for them."""
+    changes: dict[str, Any] = {}
+    for f in fields(config):  # type: ignore[arg-type]
+        value = getattr(config, f.name)
+        if f.metadata.get(_GIVEN):
+            changes[f.name] = tuple(sorted(given))
+        elif is_dataclass(value):
+            changes[f.name] = _changed(value, given)
+        elif f.name in given:
+            changes[f.name] = given[f.name]
+    return replace(config, **changes)  # type: ignore[type-var]
 
 
 def normalise(argv: Iterable[str]) -> list[str]:
@@ -196,18 +221,20 @@ def closest(flag: str, known: Iterable[str]) -> str | None:
 
 def _walk(config_type: type, defaults: Any) -> Iterator[Setting]:
     hints = get_type_hints(config_type)
-    for field in fields(config_type):
-        hint, default = hints[field.name], getattr(defaults, field.name)
+    for f in fields(config_type):
+        hint, default = hints[f.name], getattr(defaults, f.name)
         if isinstance(hint, type) and is_dataclass(hint):
             yield from _walk(hint, default)
             continue
-        where = f"{config_type.__name__}.{field.name}"
-        if not field.metadata.get("help"):
+        if f.metadata.get(_GIVEN):
+            continue
+        where = f"{config_type.__name__}.{f.name}"
+        if not f.metadata.get("help"):
             raise TypeError(f"{where} has no help: declare it with tco.config.knob")
         base, optional, many = _kind(hint, where)
-        choices = field.metadata.get("choices")
-        told, alias = field.metadata["help"], field.metadata.get("alias", "")
-        setting = Setting(field.name, base, optional, many, choices, default, told, config_type, alias)
+        choices = f.metadata.get("choices")
+        told, alias = f.metadata["help"], f.metadata.get("alias", "")
+        setting = Setting(f.name, base, optional, many, choices, default, told, config_type, alias)
         _check_default(setting, where)
         yield setting
 

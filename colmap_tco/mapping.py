@@ -98,6 +98,10 @@ def ensure_model(
         raise InputError(
             f"{sparse} is not empty and holds no model; move it away, or name one with --model_path"
         )
+    if root.name == "images" and find_models(root.parent):
+        raise InputError(
+            f"{root} holds pictures alone, and {root.parent} a model too: colmap-tco densify {root.parent}"
+        )
     _check_version(config)
     folder = find_images(root, image_path)
     names = _readable(folder, list_images(folder, recursive=folder != root))

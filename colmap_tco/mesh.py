@@ -121,7 +121,8 @@ def mesh(root: Path, config: MeshConfig, progress: Progress) -> Meshed:
     centre = cloud.points.mean(0)  # Open3D computes in float32 in places
     local = cloud.points - centre
     cell = config.cell_size or 2 * spacing(local)
-    log.info("cells of %.4g", cell)
+    of = "as --cell_size says" if config.cell_size else "twice the distance between points"
+    log.info("cells of %.4g COLMAP units, %s", cell, of)
     dropped: dict[str, int] = {}
     progress.plan({"surface": 0.8, "cleaning": 0.2})
     if config.method == "poisson":

@@ -10,7 +10,7 @@ import math
 import os
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,7 @@ from colmap_tco.maps import read_map, write_map
 from colmap_tco.ply import Cloud, needs_double, write_ply, write_vis
 from colmap_tco.sparse_format import reorder_images
 from colmap_tco.tracks import Tracks
-from colmap_tco.views import View, undistorted_image
+from colmap_tco.views import View, map_mask, undistorted_image
 from colmap_tco.workspace import DensePaths, read_image
 
 JPEG_QUALITY = 95
@@ -195,11 +195,16 @@ def fusion_views(
             camera=view.camera,
             cam_from_world=view.cam_from_world,
             neighbours=tuple(position[n] for n in neighbours[view.name] if n in position),
-            load=lambda name=view.name: read_view(paths, name),  # type: ignore[misc]
+            load=lambda view=view: _masked(read_view(paths, view.name), view),  # type: ignore[misc]
             reach=(reach or {}).get(view.name, math.inf),
         )
         for view in views
     ]
+
+
+def _masked(maps: FusionMaps, view: View) -> FusionMaps:
+    """The maps with the mask of the view, so that what it excludes counts under its own name."""
+    return replace(maps, mask=map_mask(view, maps.depth.shape))
 
 
 def reaches(tracks: Tracks, views: Sequence[View]) -> dict[str, float]:

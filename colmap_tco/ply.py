@@ -11,6 +11,7 @@ image indices, positions in ``Reconstruction.reg_image_ids()``.
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import shutil
@@ -275,15 +276,37 @@ def read_vis(path: str | os.PathLike[str]) -> Visibility:
         raise InputError(f"{path}: not a visibility file")
     points = int(np.frombuffer(data, "<u8", 1)[0])
     words = np.frombuffer(data, "<u4", offset=8)
-    start = np.zeros(min(points, len(words)) + 1, np.int64)
-    at = 0
-    for point in range(len(start) - 1):
-        if at >= len(words):
-            break
-        start[point + 1] = start[point] + int(words[at])
-        at += 1 + int(words[at])
-    if points > len(words) or at != len(words) or (points and start[-1] + points != len(words)):
+    head, end = _heads(words)
+    if head.sum() != points or end != len(words):
         raise InputError(f"{path}: damaged, its lists do not end where the file ends")
-    listed = np.ones(len(words), bool)
-    listed[start[:-1] + np.arange(points)] = False
-    return Visibility(start, words[listed].astype(np.uint32))
+    start = np.concatenate([[0], words[head].astype(np.int64).cumsum()])
+    return Visibility(start, words[~head].astype(np.uint32))
+
+
+def _heads(words: NDArray[np.uint32]) -> tuple[NDArray[np.bool_], int]:
+    """Which of N words are the counts of lists that follow one another, and where the last list ends.
+
+    Where a list begins is known from the one before it alone, so the words are cut into √N blocks. Backwards
+    through all blocks at once it is found where a walk over any of their words leaves its block; a loop over
+    the blocks gives where the true walk enters each; forwards, again through all at once, go its other steps.
+    """
+    side = max(1, math.isqrt(len(words)))
+    blocks = -(-len(words) // side)
+    after = np.arange(1, blocks * side + 1)
+    after[: len(words)] += words
+    beyond = after.reshape(blocks, side).copy()
+    last = np.minimum(np.arange(1, blocks + 1) * side, len(words))
+    for i in range(side - 1, -1, -1):
+        within = np.flatnonzero(beyond[:, i] < last)
+        beyond[within, i] = beyond[within, beyond[within, i] % side]
+    head = np.zeros(len(after), bool)
+    first, end = [], 0
+    while end < len(words):
+        first.append(end)
+        end = int(beyond.flat[end])
+    at = np.array(first, np.int64)
+    while len(at):
+        head[at] = True
+        step = after[at]
+        at = step[(step // side == at // side) & (step < len(words))]
+    return head[: len(words)], end

@@ -19,6 +19,7 @@ from tco.options import TCOConfig
 
 if TYPE_CHECKING:
     import torch
+    from torch import Tensor
 
     from tco.backbones.base import Backbone
     from tco.optimize import Outcome
@@ -110,7 +111,6 @@ def predict_chunk(
     results = {}
     for i in range(len(chunk.owned)):
         view = members[i]
-        valid = crop(view, images.valid[i]).numpy()
         figures: dict[str, object] = {
             "points": len(used[i]),
             "points_held_out": len(held[i]),
@@ -124,7 +124,9 @@ def predict_chunk(
             "correction": _correction(outcome, i, frame.scale),
         }
         corrected = corrected_view(view, frame.scale, cameras, moved, i)
-        results[view.name] = ViewResult(_maps(view, prediction, i, valid, frame.scale), figures, corrected)
+        results[view.name] = ViewResult(
+            view_maps(view, prediction, i, images.valid, frame.scale), figures, corrected
+        )
     if aligned is not None:
         own = aligned.history
         steps = [
@@ -159,10 +161,19 @@ def _correction(outcome: Outcome, i: int, scale: float) -> dict[str, float]:
     return {**{name: values[i] for name, values in sizes.items()}, "centre": sizes["centre"][i] * scale}
 
 
-def _maps(view: View, prediction: Prediction, i: int, valid: np.ndarray, scale: float) -> ViewMaps:
-    """Depth in COLMAP units, normals and confidence of one view, 0 and 1 where the image is not valid."""
-    depth = np.where(valid, crop(view, prediction.depth[i]).numpy() * scale, 0).astype(np.float32)
-    confidence = np.where(valid, crop(view, prediction.confidence[i]).numpy(), 1).astype(np.float32)
+def view_maps(view: View, prediction: Prediction, i: int, valid: Tensor, scale: float) -> ViewMaps:
+    """Depth in COLMAP units, normals and confidence of one view, 0 and 1 where the image is not valid.
+
+    Args:
+        view: that the maps are of, at the size of its ``network`` camera.
+        prediction: of the chunk, on its canvas and in its unit.
+        i: index of the view in the prediction.
+        valid: (V, H, W) bool, the chunk's ``Views.valid``.
+        scale: COLMAP units per unit of the chunk.
+    """
+    there = crop(view, valid[i]).numpy()
+    depth = np.where(there, crop(view, prediction.depth[i]).numpy() * scale, 0).astype(np.float32)
+    confidence = np.where(there, crop(view, prediction.confidence[i]).numpy(), 1).astype(np.float32)
     return ViewMaps(depth, normals_from_depth(depth, view.network), confidence)
 
 

@@ -14,16 +14,17 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_BAR = "{desc} {percentage:3.0f}%|{bar}| {elapsed}, about {remaining} left{postfix}"
+_BAR = "{desc} {percentage:3.0f}%|{bar}| {elapsed}{postfix}"
+_TOO_EARLY = 0.2
+"""Share of a run below which its time so far, with imports and compilation, says nothing of the rest."""
 
 
 class Progress:
     """Progress of a whole run, which is a sequence of stages.
 
-    A run first states what share of its time each stage takes (:meth:`plan`); the estimate follows
-    from the shares of the finished stages and the finished part of the current one. A loop over
-    chunks is one stage whose total counts all chunks. Without a plan, the estimate is that of the
-    current stage alone.
+    A run first states what share of its time each stage takes (:meth:`plan`); the estimate follows from the
+    pace of the current stage, its first step apart, and from the shares of those to come. A loop over
+    chunks is one stage whose total counts all chunks. Without a plan, it is that of the current stage alone.
 
     With ``bar`` it draws on stderr; without, it logs a line at INFO when a stage begins, and then
     one at most every ``interval`` seconds, with the figures in the record's ``data``.
@@ -38,6 +39,7 @@ class Progress:
         self._done = 0
         self._values: dict[str, float] = {}
         self._run_start = self._stage_start = self._last_line = time.monotonic()
+        self._first = (self._stage_start, 0)
         self._bar = _open_bar() if bar else None
 
     def plan(self, shares: Mapping[str, float]) -> None:
@@ -66,6 +68,7 @@ class Progress:
         self._names.append(name)
         self._total, self._done, self._values = total, 0, {}
         self._stage_start = time.monotonic()
+        self._first = (self._stage_start, 0)
         self._report(begins=True)
 
     def advance(self, n: int = 1, **values: float) -> None:
@@ -76,6 +79,8 @@ class Progress:
         """
         if not self._names:
             raise RuntimeError("advance() counts the steps of a stage: call stage() first")
+        if not self._done:
+            self._first = (time.monotonic(), n)  # what compiles or loads does so in the first step
         self._done += n
         self._values.update(values)
         self._report(begins=False)
@@ -88,6 +93,21 @@ class Progress:
             return stage
         current = self._shares[self._names[-1]] if self._names else 0.0
         return min(1.0, self._finished + current * stage)
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Estimate for the run (for the stage, where there is no plan); None while nothing tells."""
+        now = time.monotonic()
+        since, counted = self._first
+        if self._done <= counted or not counted:
+            start = self._run_start if self._shares else self._stage_start
+            return remaining(now - start, self.fraction) if self.fraction >= _TOO_EARLY else None
+        left = (now - since) / (self._done - counted) * max(0, self._total - self._done)
+        if not self._shares:
+            return left
+        own = self._shares[self._names[-1]]
+        later = max(0.0, 1 - self._finished - own)
+        return left + (now - self._stage_start + left) * later / own if own > 0 else left
 
     def close(self) -> None:
         """Take the bar off the screen, so that messages start on a clean line."""
@@ -114,26 +134,26 @@ class Progress:
             bar.reset()
         counted = f" {self._done}/{self._total}" if self._total > 1 else ""
         bar.set_description_str(self._names[-1] + counted, refresh=False)
-        bar.set_postfix(self._values, refresh=False)
+        left = self.seconds_left
+        told = [] if left is None else [f"about {clock(left)} left"]
+        told += [f"{name}={value:.3g}" for name, value in self._values.items()]
+        bar.set_postfix_str(", ".join(told), refresh=False)
         bar.update(self.fraction - bar.n)
         if begins:
             bar.refresh()
 
     def _log(self) -> None:
-        now = time.monotonic()
-        self._last_line = now
-        fraction = self.fraction
-        start = self._run_start if self._shares else self._stage_start
-        left = remaining(now - start, fraction)
+        self._last_line = time.monotonic()
+        left = self.seconds_left
         data: dict[str, Any] = {
             "stage": self._names[-1],
             "done": self._done,
             "total": self._total,
-            "fraction": round(fraction, 4),
+            "fraction": round(self.fraction, 4),
             "seconds_left": None if left is None else round(left),
             "values": dict(self._values),
         }
-        parts = [f"{self._names[-1]} {self._done}/{self._total}"]
+        parts = [self._names[-1] + (f" {self._done}/{self._total}" if self._total > 1 else "")]
         parts += [f"{name} {value:.4g}" for name, value in self._values.items()]
         parts += [] if left is None else [f"about {clock(left)} left"]
         logger.info(", ".join(parts), extra={"data": data})
@@ -161,8 +181,6 @@ def _open_bar() -> tqdm[Any]:
         file=sys.stderr,
         dynamic_ncols=True,
         leave=False,
-        # Estimate from the whole run: its stages differ too much for a recent average.
-        smoothing=0,
         # Otherwise tqdm learns a step from a quick stage and then hardly redraws in a slow one.
         miniters=0,
     )

@@ -113,7 +113,9 @@ class Result:
         write_text(self.paths.manifest, json.dumps(manifest, indent=1, allow_nan=False) + "\n")
 
 
-def open_result(root: Path, fingerprint: str, overwrite: bool = False, maps: str = "") -> Result:
+def open_result(
+    root: Path, fingerprint: str, overwrite: bool = False, maps: str = "", settings: object = None
+) -> Result:
     """Find out what there is to do, and prepare the partial folder for it.
 
     Args:
@@ -122,6 +124,7 @@ def open_result(root: Path, fingerprint: str, overwrite: bool = False, maps: str
         overwrite: make the result anew even if there is one, and let it replace the one there. The maps of
             a result that differs by what comes after them alone are kept.
         maps: fingerprint of what decides the depth maps; empty: the same as ``fingerprint``.
+        settings: of this run, as ``report.json`` holds them, so that an error can say what is different.
 
     Raises:
         InputError: a result of other settings is there and ``overwrite`` is not given; or a folder of
@@ -142,8 +145,8 @@ def open_result(root: Path, fingerprint: str, overwrite: bool = False, maps: str
         if not overwrite:
             hint = "replace it (its depth maps will be kept)" if reusable else "replace it"
             raise InputError(
-                f"{final.root} was made from other inputs or with other settings; give --overwrite to "
-                f"{hint}, or rename it to keep it"
+                f"{final.root} was made {_difference(final, settings)}; give --overwrite to {hint}, or "
+                "rename it to keep it"
             )
     record = _resume(partial, keys[1])
     if reusable and not record.views:
@@ -151,6 +154,32 @@ def open_result(root: Path, fingerprint: str, overwrite: bool = False, maps: str
     result = Result(root, keys, False, record)
     result._save(complete=False)
     return result
+
+
+def _difference(paths: DensePaths, settings: object) -> str:
+    """How the result that is there came about otherwise than by these settings."""
+    try:
+        before = _flat(json.loads(paths.report.read_text("utf-8"))["settings"])
+    except (OSError, ValueError, KeyError):
+        before = {}
+    now = _flat(settings)
+    other = [name for name in now if name in before and before[name] != now[name] and name not in _FREE]
+    if not other:
+        return "from other inputs, with other settings or by another version"
+    told = [f"{name} {json.dumps(before[name])}, now {json.dumps(now[name])}" for name in other]
+    return f"with other settings ({'; '.join(told)})"
+
+
+_FREE = ("given", "overwrite", "report_page", "num_threads")
+"""Settings that do not change the result."""
+
+
+def _flat(settings: object) -> dict[str, object]:
+    """Settings by name, those of nested groups among them; their names are all different."""
+    found: dict[str, object] = {}
+    for name, value in settings.items() if isinstance(settings, dict) else ():
+        found |= _flat(value) if isinstance(value, dict) else {name: value}
+    return found
 
 
 def _resume(partial: DensePaths, maps: str) -> _Record:

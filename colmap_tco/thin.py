@@ -15,6 +15,8 @@ _TRIES = 40
 """Sizes of cubes that are tried for a number of points."""
 _CLOSE = 0.98
 """Share of the points allowed that is near enough to be taken."""
+_FEWEST = 0.9
+"""Share of the points allowed below which cubes alone are not enough."""
 _MOST_CELLS = 2.0**62
 """Cells of a grid that a 64-bit number still tells apart."""
 
@@ -26,7 +28,8 @@ def thin(points: NDArray[np.float64], voxel_size: float = 0.0, max_points: int =
         points: positions.
         voxel_size: side of the cubes of which each keeps the point nearest to the mean of its points. 0: off.
         max_points: most points that may stay; cubes just large enough are found by interpolation of the
-            logarithms of size and number, and bisection where that leaves the bracket. 0: off.
+            logarithms of size and number, and bisection where that leaves the bracket. Where no size leaves
+            nearly so many, as with points on a lattice, every cube gets more of its own in turn. 0: off.
 
     Raises:
         ValueError: the cubes are too small to be told apart.
@@ -36,8 +39,33 @@ def thin(points: NDArray[np.float64], voxel_size: float = 0.0, max_points: int =
         kept = _nearest(points, _cells(points, voxel_size))
     if max_points > 0 and len(kept) > max_points:
         left = points[kept]
-        kept = kept[_nearest(left, _cells(left, _size_for(left, max_points)))]
+        size, smaller = _sizes_for(left, max_points)
+        cell = _cells(left, size)
+        few = _nearest(left, cell)
+        if len(few) < _FEWEST * max_points:
+            few = _more(few, _nearest(left, _cells(left, smaller)), cell, max_points)
+        kept = kept[few]
     return kept
+
+
+def _more(
+    few: NDArray[np.int64], many: NDArray[np.int64], cell: NDArray[np.int64], most: int
+) -> NDArray[np.int64]:
+    """``few`` and as many of ``many`` as are allowed: one more in each cell, then a second one, and so on.
+
+    Of the last round, which is not for all cells, those are taken whose cells are evenly spread in number.
+    """
+    others = np.setdiff1d(many, few)
+    others = others[np.argsort(cell[others], kind="stable")]
+    first = np.searchsorted(cell[others], cell[others])  # where the points of the same cell begin
+    turn = np.arange(len(others)) - first
+    room = most - len(few)
+    rounds = np.bincount(turn, minlength=1).cumsum()
+    last = int(np.searchsorted(rounds, room, side="right"))
+    whole, rest = others[turn < last], others[turn == last]
+    left = min(room - len(whole), len(rest))
+    part = rest[np.arange(left) * len(rest) // max(left, 1)]
+    return np.sort(np.concatenate([few, whole, part]))
 
 
 def _cells(points: NDArray[np.float64], size: float) -> NDArray[np.int64]:
@@ -63,11 +91,14 @@ def _nearest(points: NDArray[np.float64], cell: NDArray[np.int64]) -> NDArray[np
     return np.sort(order[first])
 
 
-def _size_for(points: NDArray[np.float64], most: int) -> float:
-    """Side of cubes of which at most ``most``, and if it can be nearly so many, hold points."""
+def _sizes_for(points: NDArray[np.float64], most: int) -> tuple[float, float]:
+    """Sides of cubes: of which at most ``most``, if it can be nearly so many, hold points; of which more do.
+
+    Where no cubes do, as most of the points coincide, the second is that of the smallest tried.
+    """
     extent = float((points.max(0) - points.min(0)).max())
     if extent == 0.0:
-        return 1.0  # all points are one
+        return 1.0, 1.0  # all points are one
     high, at_high = 2 * extent, 1.0
     low, at_low = extent / 2**19, float(len(points))
     best = high
@@ -85,4 +116,4 @@ def _size_for(points: NDArray[np.float64], most: int) -> float:
             low, at_low = size, float(number)
         if high / low < 1 + 1e-6:
             break
-    return best
+    return best, low

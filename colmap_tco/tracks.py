@@ -73,7 +73,7 @@ class Covisibility:
     score: Floats
 
 
-def read_tracks(model: Model) -> Tracks:
+def read_tracks(model: Model, level: int = logging.DEBUG) -> Tracks:
     """All tracks of a model, without observations that contradict it.
 
     An observation is dropped if its point is behind the camera or projects further away than four
@@ -84,6 +84,10 @@ def read_tracks(model: Model) -> Tracks:
     σ² (Σ JᵀJ)⁻¹ with J = ∂(pixel) / ∂(point): long tracks and wide angles make it small, and its
     direction along a viewing ray is where the depth is uncertain. σ is the track's own residual,
     shrunk to that of the model (:data:`PRIOR_WEIGHT`), because 2n − 3 degrees of freedom say little.
+
+    Args:
+        model: with points.
+        level: of the log record that says how many are used, and how many observations are not, and why.
 
     Raises:
         InputError: no point is left.
@@ -119,7 +123,9 @@ def read_tracks(model: Model) -> Tracks:
         good = accepted[image_id] & keep[obs.point]
         images[image_id] = Observations(obs.xy[good], renumber[obs.point[good]], obs.error[good])
     dropped = {"behind the camera": behind, f"off by more than {limit:.1f} px": far, "seen once": singles}
-    log.info("%d points, median reprojection error %.2f px; dropped: %s", keep.sum(), typical, dropped)
+    lost = ", ".join(f"{count} {why}" for why, count in dropped.items() if count)
+    told = f"; observations not used: {lost}" if lost else ""
+    log.log(level, "%d points, median reprojection error %.2f px%s", keep.sum(), typical, told)
     centres = {
         e.image_id: -e.cam_from_world[:, :3].T @ e.cam_from_world[:, 3] for e in _pycolmap.registered(model)
     }

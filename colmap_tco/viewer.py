@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import webbrowser
 from collections.abc import Sequence
@@ -65,6 +66,25 @@ class Scene:
         keep: NDArray[np.bool_] = (self.confidence >= confidence) & (self.seen >= views)
         return keep
 
+    def overview(self) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+        """Where to look from first (3,) and at what (3,), and their distance: behind the middle camera.
+
+        The middle one is the nearest to the mean of all; what it looks at is as far away as the points before
+        it are in the median.
+        """
+        import numpy as np
+
+        poses = [view.cam_from_world for view in self.views]
+        centres = np.array([-m[:, :3].T @ m[:, 3] for m in poses])
+        middle = int(np.argmin(((centres - centres.mean(0)) ** 2).sum(1)))
+        eye, ahead = centres[middle] - self.origin, poses[middle][2, :3]
+        points = self.points if len(self.points) else self.sparse
+        depth = (points - eye) @ ahead
+        away = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
+        position = eye + away * (0.25 * self.up - 0.5 * ahead)
+        target = eye + away * ahead
+        return position, target, float(np.linalg.norm(target - position))
+
 
 def read_scene(paths: DensePaths, max_points: int) -> Scene:
     """Read a finished result.
@@ -114,6 +134,7 @@ class Viewer:
             host=config.host, port=config.port, label="colmap-tco", verbose=False
         )
         self.server.scene.set_up_direction(tuple(float(value) for value in scene.up))
+        self._look()
         self._add_cameras()
         self._add_controls()
         self.refresh()
@@ -144,6 +165,12 @@ class Viewer:
         shown = int(keep.sum())
         self.count.content = f"{shown:,} of {len(keep):,} points"
         return shown
+
+    def _look(self) -> None:
+        """Begin with an overview; the planes that cut near and far follow the size of the scene."""
+        camera = self.server.initial_camera
+        camera.position, camera.look_at, away = self.scene.overview()
+        camera.near, camera.far = away / 1000, 1000 * away
 
     def _spacing(self) -> float:
         """A length by which neighbouring points of the cloud are apart, roughly."""
@@ -185,13 +212,14 @@ class Viewer:
 
         gui, scene = self.server.gui, self.scene
         top = float(np.percentile(scene.confidence, 99)) if len(scene.confidence) else 1.0
+        top = max(1.0, math.ceil(10 * top) / 10)
         most = int(scene.seen.max()) if len(scene.seen) else 1
         self.count = gui.add_markdown("")
         self.dense = gui.add_checkbox("dense cloud", True)
         self.sparse = gui.add_checkbox("sparse points", False)
         self.cameras = gui.add_checkbox("cameras", True)
         # A slider needs two ends that differ.
-        self.confidence = gui.add_slider("least confidence", 0.0, max(1.0, top), max(1.0, top) / 100, 0.0)
+        self.confidence = gui.add_slider("least confidence", 0.0, top, 0.1, 0.0)
         self.seen = gui.add_slider("least views", 0, max(1, most), 1, 0)
         self.size = gui.add_slider("point size", 0.2, 5.0, 0.1, 1.0)
         for control in (self.dense, self.sparse, self.cameras, self.confidence, self.seen, self.size):

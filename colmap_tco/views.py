@@ -13,7 +13,7 @@ Views of one chunk are padded symmetrically to a common canvas, which keeps prin
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -199,21 +199,52 @@ def undistorted_image(view: View) -> tuple[NDArray[np.uint8], Mask]:
     image = np.zeros((camera.height, camera.width, 3), np.uint8)
     cells = trusted_cells(view.original, camera)
     valid = cells.repeat(CELL, 0).repeat(CELL, 1)[: camera.height, : camera.width]
-    for top in range(0, camera.height, _BAND):
-        rows = slice(top, min(top + _BAND, camera.height))
-        x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(rows.start, rows.stop) + 0.5)
-        rays = camera.normalised(np.stack([x, y], -1).reshape(-1, 2))
-        pixels = _pycolmap.img_from_cam(view.original, rays).reshape(*x.shape, 2)
+    for rows, pixels in _bands(view):
         with np.errstate(invalid="ignore"):
             valid[rows] &= ((pixels >= 0) & (pixels <= _pycolmap.camera_size(view.original))).all(-1)
-        # OpenCV's coordinates put the centre of the first pixel at 0.
-        at = np.nan_to_num(pixels - 0.5, nan=-1e6).astype(np.float32)
-        u, v = np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1])
+        u, v = _for_opencv(pixels)
         image[rows] = cv2.remap(source, u, v, cv2.INTER_CUBIC, borderMode=edge)
         if mask is not None:
             valid[rows] &= cv2.remap(mask, u, v, cv2.INTER_NEAREST, borderMode=edge) > 0
     image[~valid] = 0
     return image, valid
+
+
+def map_mask(view: View, shape: tuple[int, ...]) -> Mask | None:
+    """Where the user's mask keeps at least half of a pixel (H, W) of a map of this shape; None without one.
+
+    A pixel that it does not keep is not valid in :func:`network_image` either.
+
+    Raises:
+        InputError: the mask cannot be read or has another size than the camera.
+    """
+    import cv2
+
+    mask = _read_mask(view)
+    if mask is None:
+        return None
+    kept = np.empty((view.camera.height, view.camera.width), np.float32)
+    for rows, pixels in _bands(view):
+        warped = cv2.remap(mask, *_for_opencv(pixels), cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+        kept[rows] = warped > 0
+    share: Mask = cv2.resize(kept, shape[1::-1], interpolation=cv2.INTER_AREA) >= 0.5
+    return share
+
+
+def _bands(view: View) -> Iterator[tuple[slice, Floats]]:
+    """Bands of rows of the undistorted image, and the original pixels (h, W, 2) that they show."""
+    camera = view.camera
+    for top in range(0, camera.height, _BAND):
+        rows = slice(top, min(top + _BAND, camera.height))
+        x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(rows.start, rows.stop) + 0.5)
+        rays = camera.normalised(np.stack([x, y], -1).reshape(-1, 2))
+        yield rows, _pycolmap.img_from_cam(view.original, rays).reshape(*x.shape, 2)
+
+
+def _for_opencv(pixels: Floats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Pixels (h, W, 2) as ``cv2.remap`` wants them: the centre of the first pixel is at 0."""
+    at = np.nan_to_num(pixels - 0.5, nan=-1e6).astype(np.float32)
+    return np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1])
 
 
 def _check_size(view: View, path: Path, picture: NDArray[Any]) -> None:

@@ -21,7 +21,7 @@ from tco.options import TCOConfig
 from tco.penalties import sparse_depth
 from tco.polish import polish
 from tco.schedule import Sources, Stagnation, draw_targets
-from tco.terms import COMPATIBILITY, Terms, errors_at, means
+from tco.terms import COMPATIBILITY, ExtraTerm, Terms, errors_at, means
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
 
 logger = logging.getLogger(__name__)
@@ -60,6 +60,7 @@ def optimize(
     seed: int = 0,
     report: Report | None = None,
     watched: Sequence[SparseDepth] = (),
+    extra: Sequence[ExtraTerm] = (),
 ) -> Outcome:
     """Adapt ``backbone`` to the views and predict all of them; the network is left as it was.
 
@@ -81,6 +82,8 @@ def optimize(
         watched: points of each view that nothing is fitted to. The history then holds ``held_out``: the mean
             over a step's sources of the median relative error at their points, as they are decoded in the
             step, with a part of their input points hidden, or refined in it. It steers nothing.
+        extra: penalties of the caller's own (:class:`tco.terms.ExtraTerm`), lowered with the others, in the
+            steps on the network and in those on the depths.
 
     Raises:
         ValueError: a term has a weight and its prior is missing, or nothing may change.
@@ -104,14 +107,15 @@ def optimize(
         first = backbone.decode(encoded)
     if config.steps == 0:
         return Outcome(first, first.cameras)
-    run = _Run(backbone, views, priors, config, encoded, first, torch.Generator().manual_seed(seed))
+    terms, generator = Terms(views, priors, config, extra), torch.Generator().manual_seed(seed)
+    run = _Run(backbone, views, priors, terms, encoded, first, generator)
     run.watched = watched
     with run.adapters() as parameters:
         run.prepare(parameters)
         for step in range(config.steps):
-            terms = run.step(step)
+            figures = run.step(step)
             if report is not None:
-                report(step, terms)
+                report(step, figures)
             if run.stopped:
                 logger.info("stopped after %d steps: the error at hidden points falls no more", step + 1)
                 break
@@ -123,14 +127,15 @@ class _Run:
     """State of one optimisation."""
 
     def __init__(
-        self, backbone: Backbone, views: Views, priors: Priors, config: TCOConfig,
+        self, backbone: Backbone, views: Views, priors: Priors, terms: Terms,
         encoded: Any, context: Prediction, generator: torch.Generator,
     ) -> None:  # fmt: skip
         if priors.cameras is None and backbone.uses_cameras:
             raise ValueError(f"{backbone.name} needs cameras, overlap and sparse points as priors")
+        config = terms.config
         self.backbone, self.views, self.priors, self.config = backbone, views, priors, config
         self.encoded, self.context, self.generator = encoded, context, generator
-        self.terms = Terms(views, priors, config)
+        self.terms = terms
         self.encoded_cameras = priors.cameras
         movable = config.camera_rate > 0 and priors.cameras is not None
         self.corrections = CameraCorrections(priors) if movable else None

@@ -180,6 +180,32 @@ def depth(predicted: Tensor, prior: Tensor, mask: Tensor) -> Tensor:
     return (scale * predicted + shift - prior)[mask].abs().mean()
 
 
+def depth_uncertain(
+    predicted: Tensor, prior: Tensor, mask: Tensor, sigma: Tensor, kernel: str = "huber"
+) -> Tensor:
+    """Mean robust penalty on the relative inverse depth, z / d − 1, in standard deviations, over the mask.
+
+    The dense twin of :func:`sparse_depth`: the prior is in the unit of the cameras, as a sensor's depth is
+    once its scale to COLMAP is known, and nothing is aligned.
+
+    Args:
+        predicted: d (V, H, W), positive.
+        prior: z (V, H, W), in the same unit.
+        mask: (V, H, W) bool, where the prior is known.
+        sigma: (V, H, W) standard deviation of the prior's relative error, positive where the mask is set.
+        kernel: quadratic, huber or cauchy.
+
+    Raises:
+        ValueError: the mask is empty, or a standard deviation in it is not positive.
+    """
+    if not bool(mask.any()):
+        raise ValueError("the depth prior is empty: no pixel of its mask is set")
+    if not bool((sigma[mask] > 0).all()):
+        raise ValueError("the standard deviation of a dense depth must be positive where there is a depth")
+    error = prior[mask] / predicted[mask].clamp_min(1e-6) - 1
+    return robust(error / sigma[mask], kernel, THRESHOLD).mean()
+
+
 def depth_reference(
     predicted: Tensor, prior: Tensor, mask: Tensor, confidence: Tensor, quantile: float = 0.0
 ) -> Tensor:

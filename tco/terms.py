@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -18,8 +19,38 @@ from tco.warping import disagreement, warp, warped_photometric
 
 logger = logging.getLogger(__name__)
 
+Penalty = Callable[[int, Tensor, Cameras], "Tensor | None"]
+"""Of a view, its depth (H, W) and the cameras of all views: a scalar, or None where there is none."""
+
+
+@dataclass(frozen=True)
+class ExtraTerm:
+    """A penalty of the caller's own, lowered together with the others.
+
+    Attributes:
+        name: under which the history has it; none that a term has already.
+        weight: of it in the sum; 0: it is not computed.
+        penalty: called with the index of a step's source view, its depth (H, W), and the cameras of all V
+            views as they are believed now. It is differentiable in both, and None of a view of which it has
+            nothing to say. The world and the unit of length are those of the priors.
+    """
+
+    name: str
+    weight: float
+    penalty: Penalty
+
+    def __post_init__(self) -> None:
+        if self.name in OWN or self.weight < 0:
+            raise ValueError(
+                f"an extra term needs a name other than {', '.join(sorted(OWN))} and a weight that is not "
+                f"negative, not {self.name!r} and {self.weight}"
+            )
+
+
 COMPATIBILITY = frozenset({"photometric", "geometric", "warped", "consistency"})
 """Terms that compare a view with others."""
+OWN = COMPATIBILITY | {"smoothness", "sparse", "depth", "cameras", "loss", "hidden", "held_out"}
+"""Names that the history has already."""
 
 
 class Terms:
@@ -30,13 +61,18 @@ class Terms:
         overlap: (V, V) how much views share; all alike where it is not known.
     """
 
-    def __init__(self, views: Views, priors: Priors, config: TCOConfig) -> None:
+    def __init__(
+        self, views: Views, priors: Priors, config: TCOConfig, extra: Sequence[ExtraTerm] = ()
+    ) -> None:
         """Check that every term that has a weight has its data.
 
         Raises:
-            ValueError: it has not.
+            ValueError: it has not, or two extra terms have one name.
         """
         self.views, self.config, self.given, self.depth = views, config, priors.cameras, priors.depth
+        self.depth_sigma, self.extra = priors.depth_sigma, tuple(extra)
+        if len({term.name for term in extra}) < len(extra):
+            raise ValueError(f"extra terms of one name: {', '.join(term.name for term in extra)}")
         if config.depth_weight > 0 and priors.depth is None:
             raise ValueError("depth_weight is set and there is no dense depth among the priors")
         if self.given is None:
@@ -72,6 +108,7 @@ class Terms:
             "sparse": c.sparse_weight,
             "depth": c.depth_weight,
             "cameras": cameras if movable else 0.0,
+            **{term.name: term.weight for term in self.extra},
         }
         return {name: weight for name, weight in every.items() if weight > 0}
 
@@ -96,6 +133,10 @@ class Terms:
             terms["sparse"] = penalties.sparse_depth(depth, self.sparse[source])
         if "depth" in weights:
             terms |= self._depth(prediction)
+        for term in self.extra:
+            value = term.penalty(source, depth, cameras) if term.name in weights else None
+            if value is not None:
+                terms[term.name] = value
         if not targets:
             return terms
         try:
@@ -105,13 +146,19 @@ class Terms:
         return terms
 
     def _depth(self, prediction: Prediction) -> dict[str, Tensor]:
-        """Penalty of the dense prior on the views that were predicted, after one common scale and shift."""
+        """Penalty of the dense prior on the views that were predicted.
+
+        In standard deviations where these are known, else after one common scale and shift.
+        """
         assert self.depth is not None
         chosen = list(prediction.views)
         mask = (self.depth[chosen] > 0) & self.views.valid[chosen]
         if int(mask.sum()) < 2:
             return {}
-        return {"depth": penalties.depth(prediction.depth, self.depth[chosen], mask)}
+        given = prediction.depth, self.depth[chosen], mask
+        if self.depth_sigma is not None:
+            return {"depth": penalties.depth_uncertain(*given, self.depth_sigma[chosen])}
+        return {"depth": penalties.depth(*given)}
 
     def _compatibility(
         self, source: int, targets: list[int], prediction: Prediction, context: Prediction,

@@ -126,6 +126,8 @@ class Priors(_Movable):
         rotation_sigma: (V,) standard deviation of the pose prior's rotation, radians.
         centre_sigma: (V,) standard deviation of the camera centre, in units of length.
         focal_sigma: (V,) standard deviation of the relative focal length.
+        depth_sigma: (V, H, W) standard deviation of the relative error of the dense depth, which then is in
+            the unit of the cameras; None: not known, and the depth is of any scale and shift.
     """
 
     cameras: Cameras | None = None
@@ -135,6 +137,7 @@ class Priors(_Movable):
     rotation_sigma: Tensor | None = None
     centre_sigma: Tensor | None = None
     focal_sigma: Tensor | None = None
+    depth_sigma: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -35,10 +35,9 @@ class ExportConfig:
     )
     max_points: int | None = knob(
         None,
-        "Points to keep, chosen at random; 0 keeps all. none: 400000 for 3dgs, whose trainers want 300 to "
-        "500 thousand, and all for the others. openmvs always gets all.",
+        "Most points to keep, spread evenly: one in each cube of a grid; 0 keeps all. none: 400000 for "
+        "3dgs, whose trainers want 300 to 500 thousand, and all for the others. openmvs always gets all.",
     )
-    seed: int = knob(0, "Seed of that choice.")
     overwrite: bool = knob(False, "Replace an earlier export.")
 
     def points(self, usual: int) -> int:
@@ -67,7 +66,9 @@ class Exported:
         return f"{self.path}: {self.told}"
 
 
-def export(format: str, root: Path, config: ExportConfig, progress: Progress) -> Exported:
+def export(
+    format: str, root: Path, config: ExportConfig = ExportConfig(), progress: Progress | None = None
+) -> Exported:
     """Write the dense workspace of ``root`` in one of :data:`FORMATS`.
 
     The files appear complete or not at all.
@@ -77,6 +78,7 @@ def export(format: str, root: Path, config: ExportConfig, progress: Progress) ->
         MissingError: a package that the format needs is not installed.
     """
     dense = open_dense(root)
+    progress = progress or Progress()
     progress.stage(f"export {format}", 1)
     if format == "las":
         from colmap_tco.export.las import write_las
@@ -84,7 +86,7 @@ def export(format: str, root: Path, config: ExportConfig, progress: Progress) ->
         target = config.output_path or dense.paths.ply.with_suffix(".laz")
         if target.exists() and not config.overwrite:
             raise InputError(f"{target} exists; replace it with --overwrite or name another with -o")
-        told = write_las(dense, target, config.points(0), config.seed)
+        told = write_las(dense, target, config.points(0))
     else:
         target = config.output_path or dense.paths.root.with_name(f"{dense.paths.root.name}-{format}")
         told = _into_folder(
@@ -98,11 +100,11 @@ def _write_folder(format: str, dense: Dense, folder: Path, config: ExportConfig)
     from colmap_tco.export import openmvs, splatting, text
 
     if format == "3dgs":
-        return splatting.write_3dgs(dense, folder, config.points(splatting.USUAL_POINTS), config.seed)
+        return splatting.write_3dgs(dense, folder, config.points(splatting.USUAL_POINTS))
     if format == "openmvs":
         return openmvs.write_openmvs(dense, folder)
     if format == "text":
-        return text.write_text_model(dense, folder, config.points(0), config.seed)
+        return text.write_text_model(dense, folder, config.points(0))
     raise ValueError(f"{format!r} is not one of {', '.join(FORMATS)}")
 
 

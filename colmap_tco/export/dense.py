@@ -12,7 +12,8 @@ from colmap_tco import _pycolmap
 from colmap_tco._pycolmap import Floats, Model
 from colmap_tco.errors import InputError
 from colmap_tco.pinhole import Pinhole
-from colmap_tco.ply import Cloud, Visibility, read_ply, read_vis
+from colmap_tco.ply import Cloud, read_ply, read_vis
+from colmap_tco.thin import thin
 from colmap_tco.workspace import DensePaths, dense_paths, existing_root
 
 log = logging.getLogger(__name__)
@@ -105,22 +106,11 @@ def open_dense(root: Path) -> Dense:
     return Dense(paths, model, tuple(views))
 
 
-def thinned(cloud: Cloud, max_points: int, seed: int) -> Cloud:
-    """At most so many points, chosen at random by ``seed``, in their old order; 0 keeps all."""
+def thinned(cloud: Cloud, max_points: int) -> Cloud:
+    """At most so many points, evenly spread (:mod:`colmap_tco.thin`), in their old order; 0 keeps all."""
     if not 0 < max_points < len(cloud):
         return cloud
-    chosen = np.sort(np.random.default_rng(seed).choice(len(cloud), max_points, replace=False))
-    return selected(cloud, chosen)
-
-
-def selected(cloud: Cloud, chosen: np.ndarray) -> Cloud:
-    """The points at these positions (K,), in ascending order."""
-    start, images = cloud.visibility.start, cloud.visibility.images
-    count = np.diff(start)
-    keep = np.zeros(len(cloud), bool)
-    keep[chosen] = True
-    kept = Visibility(np.concatenate([[0], count[chosen].cumsum()]), images[np.repeat(keep, count)])
-    return Cloud(cloud.points[chosen], cloud.normals[chosen], cloud.colors[chosen], kept)
+    return cloud.select(thin(cloud.points, max_points=max_points))
 
 
 def flat_names(names: list[str]) -> dict[str, str]:

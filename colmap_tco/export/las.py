@@ -26,7 +26,7 @@ _WIDEN = 257
 """255 becomes 65535."""
 
 
-def write_las(dense: Dense, path: Path, max_points: int, seed: int) -> str:
+def write_las(dense: Dense, path: Path, max_points: int) -> str:
     """Write the cloud to a .las or .laz file; returns a sentence on what is in it.
 
     Raises:
@@ -41,7 +41,7 @@ def write_las(dense: Dense, path: Path, max_points: int, seed: int) -> str:
             raise MissingError(f"{path.name} needs {module}; install it with: pip install 'colmap-tco[las]'")
     import laspy
 
-    cloud = thinned(dense.cloud(), max_points, seed)
+    cloud = thinned(dense.cloud(), max_points)
     scale, offset = scale_and_offset(cloud.points, spacing(cloud.points))
     header = laspy.LasHeader(version="1.4", point_format=7)
     header.global_encoding.wkt = True  # the standard demands it of this point format

@@ -20,13 +20,13 @@ USUAL_POINTS = 400_000
 """Trainers start well from 300 to 500 thousand points."""
 
 
-def write_3dgs(dense: Dense, folder: Path, max_points: int, seed: int) -> str:
+def write_3dgs(dense: Dense, folder: Path, max_points: int) -> str:
     """Fill ``folder``; returns a sentence on what is in it.
 
     Raises:
         InputError: no cloud, no visibility, or a missing image.
     """
-    cloud = thinned(dense.cloud(), max_points, seed)
+    cloud = thinned(dense.cloud(), max_points)
     names = flat_names([view.name for view in dense.views])
     model, cloud = dense_model(dense, cloud, names)
     copy_images(dense, names, folder / "images")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_tco.errors import InputError
-from colmap_tco.export.dense import Dense, DenseView, selected
+from colmap_tco.export.dense import Dense, DenseView
 from colmap_tco.ply import Cloud
 from colmap_tco.sparse_format import SparseImage, SparseModel, SparsePoints
 
@@ -49,7 +49,7 @@ def dense_model(dense: Dense, cloud: Cloud, names: Mapping[str, str]) -> tuple[S
     if not enough.all():
         log.info("%d points are left out: they fall into fewer than two images", int((~enough).sum()))
     seen &= enough[owner]
-    kept = selected(cloud, np.flatnonzero(enough))
+    kept = cloud.select(np.flatnonzero(enough))
     new = np.cumsum(enough)  # position of a point that is kept, counted from 1: its id
     return _model(dense, kept, (cloud.visibility.images[seen], new[owner[seen]], xy[seen]), names), kept
 

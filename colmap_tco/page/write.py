@@ -33,7 +33,7 @@ def write_page(paths: DensePaths, report: Mapping[str, Any], limits: Limits = Li
     """
     page = filled(content(paths, report, limits))
     write_text(paths.page, page)
-    log.info("%s: %.1f MB", paths.page, len(page) / 1e6)
+    log.info("%s: %.1f MB", paths.page.name, len(page) / 1e6)
     return paths.page
 
 

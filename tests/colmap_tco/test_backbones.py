@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from colmap_tco import flags
 from colmap_tco.backbones import NetworkConfig, Selected, _best, choose_device, load, select, suited
+from colmap_tco.densify import DensifyConfig
 from colmap_tco.errors import MissingError
 from colmap_tco.published import NETWORKS, PUBLISHED
 from colmap_tco.weights import _note_accepted, cached
@@ -84,7 +87,7 @@ def test_weights_that_are_missing_or_foreign_are_an_error(tmp_path: Path, backbo
 def test_the_network_in_the_package_needs_nothing_and_is_frozen() -> None:
     chosen = select(NetworkConfig(device="cpu"))
     assert chosen.network.name == "sweep" and chosen.weights == EMBEDDED
-    assert "no weights of vggt or vggt-commercial or pi3 or da3 or da3-small were fetched" in chosen.reason
+    assert "no weights of a larger network were fetched" in chosen.reason
     network = load(chosen)
     assert isinstance(network, torch.nn.Module) and not network.training
     assert not any(p.requires_grad for p in network.parameters())
@@ -113,7 +116,7 @@ def test_auto_needs_an_accepted_licence_and_a_fast_device(tmp_path: Path) -> Non
     path = fetched(tmp_path, "pi3")
     assert cached(PUBLISHED["pi3"][1]) == path
     network, reason = _best(cpu)
-    assert network.name == "sweep" and "were fetched" in reason
+    assert network.name == "sweep" and "the licence of pi3's weights was not accepted" in reason
     _note_accepted(*PUBLISHED["pi3"])
     network, reason = _best(cpu)
     assert network.name == "sweep"
@@ -151,7 +154,7 @@ def test_a_package_that_is_not_installed_is_told_with_the_command(
     assert str(told.value).endswith(INSTALL)
     fetched(tmp_path, name)
     _note_accepted(*PUBLISHED[name])
-    assert _best(torch.device("cpu"))[1].startswith("auto: no weights of")
+    assert _best(torch.device("cpu"))[1].startswith(f"auto: {name} needs no_such_module, not installed")
 
 
 def test_weights_of_another_network_are_refused_before_they_are_read(tmp_path: Path) -> None:
@@ -178,6 +181,16 @@ def test_the_registry_agrees_with_the_networks(tmp_path: Path) -> None:
         assert layers(backbone.decoder(), config.lora_targets)
 
 
+def test_a_default_that_the_command_line_names_stands() -> None:
+    parser = argparse.ArgumentParser()
+    flags.add_flags(parser, DensifyConfig)
+    config = flags.build(DensifyConfig, parser.parse_args(["--rate", str(TCOConfig().rate)]))
+    assert config.given == ("rate",) and config.tco == TCOConfig()
+    vggt = suited(config.tco, NETWORKS["vggt"], config.given)
+    assert vggt.rate == TCOConfig().rate
+    assert vggt.lora_targets == NETWORKS["vggt"].tco["lora_targets"] != TCOConfig().lora_targets
+
+
 def test_the_networks_own_settings_hold_where_the_user_gave_none() -> None:
     vggt = NETWORKS["vggt"]
     assert suited(TCOConfig(), NETWORKS["sweep"]) == TCOConfig()
@@ -185,3 +198,6 @@ def test_the_networks_own_settings_hold_where_the_user_gave_none() -> None:
     mine = suited(TCOConfig(rate=3e-3, steps=7), vggt)
     assert mine.rate == 3e-3 and mine.steps == 7
     assert mine.lora_targets == ("qkv", "proj", "fc1", "fc2")
+    asked = suited(TCOConfig(), vggt, given=("rate", "steps"))
+    assert asked.rate == TCOConfig().rate != 5e-4
+    assert asked.lora_targets == mine.lora_targets

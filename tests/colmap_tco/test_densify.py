@@ -209,7 +209,7 @@ def test_the_report_says_what_was_done(done: Done) -> None:
 def test_the_summary_names_the_cloud_and_the_quality(done: Done) -> None:
     text = done.result.summary()
     assert str(done.dense / "fused.ply") in text and str(done.dense / "report.json") in text
-    assert "held-out points within 5 %" in text and "made" in text
+    assert "depths at held-out points within 5 %" in text and "made" in text
 
 
 def test_a_second_run_says_that_all_is_done_and_changes_nothing(done: Done) -> None:

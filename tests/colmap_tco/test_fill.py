@@ -6,6 +6,7 @@ import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -93,6 +94,26 @@ def test_kept_depths_are_exact_and_the_others_ours(made: Made) -> None:
         assert np.abs(ratio[~kept] / BIAS - 1).max() < 1e-4
         assert (maps.confidence[~kept] == 3).all()
         assert np.median(np.abs(maps.normal @ view.cam_from_world[:, :3] - NORMAL)) < 0.01
+
+
+def test_what_the_mask_excludes_is_neither_kept_nor_filled(made: Made, tmp_path: Path) -> None:
+    """The upper half of the original picture: of a plane, exactly the pixels whose rays end there."""
+    view, existing = made.views[0], open_existing(FillConfig(str(made.dense.root)), made.views)
+    assert existing is not None
+    mask = np.full((360, 480), 255, np.uint8)
+    mask[:180] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    whole, counts = fill(existing, view, maps_of(view))
+    cut, fewer = fill(existing, replace(view, mask_path=tmp_path / "mask.png"), maps_of(view))
+    kept = cut.depth > 0
+    assert np.array_equal(cut.depth[kept], whole.depth[kept])
+    assert 0.45 < kept.sum() / (whole.depth > 0).sum() < 0.55
+    assert not cut.normal[~kept].any() and (cut.confidence[~kept] == 1).all()
+    assert fewer["pixels_kept"] < 0.6 * counts["pixels_kept"]  # type: ignore[operator]
+    camera = view.camera.resized(kept.shape[1], kept.shape[0])
+    v, u = np.nonzero(kept)
+    original = _pycolmap.img_from_cam(view.original, camera.normalised(np.c_[u + 0.5, v + 0.5]))
+    assert original[:, 1].min() > 179
 
 
 def test_views_without_a_map_stay_as_they_are(made: Made) -> None:

@@ -169,3 +169,11 @@ def test_the_database_is_only_read(mapped: Path) -> None:
     assert (mapped / "database.db").read_bytes() == before
     with pytest.raises(sqlite3.OperationalError):
         largest_descriptors(mapped / "none.db")
+
+
+def test_the_folder_of_pictures_of_a_workspace_is_no_workspace(mapped: Path) -> None:
+    """The folder above was meant; nothing is mapped anew, and nothing written beside the pictures."""
+    before = sorted((mapped / "images").rglob("*"))
+    with pytest.raises(InputError, match=f"colmap-tco densify {mapped}$"):
+        ensure_model(mapped / "images", num_threads=1)
+    assert sorted((mapped / "images").rglob("*")) == before

@@ -75,10 +75,9 @@ def test_poisson_without_trimming_closes_a_bubble_and_trimming_opens_it(root: Pa
     shutil.copytree(root / "dense-tco", tmp_path / "dense")
     keep = np.linalg.norm(points[:, :2], axis=1) > 0.5  # a hole that Poisson spans
     write_ply(tmp_path / "dense" / "fused.ply", points[keep], normals[keep], colors[keep])
-    from colmap_tco.export.dense import selected
     from colmap_tco.ply import write_vis
 
-    cloud = selected(open_dense(root).cloud(), np.flatnonzero(keep))
+    cloud = open_dense(root).cloud().select(np.flatnonzero(keep))
     write_vis(tmp_path / "dense" / "fused.ply.vis", cloud.visibility)
     nothing = {"trim": np.inf, "max_distance": np.inf, "min_part": 0.0}
     closed, _, _ = read(made(tmp_path / "dense", tmp_path / "closed.ply", **nothing).path)

@@ -367,6 +367,18 @@ def test_a_finished_view_with_a_lost_file_is_made_again(workspace: Path) -> None
     assert again.is_done(views[1].name)
 
 
+def test_an_error_says_which_settings_are_others(workspace: Path) -> None:
+    result = open_result(workspace, "one")
+    before = {"settings": {"views": {"max_image_size": 0}, "steps": 10, "num_threads": 1}}
+    write_report(result.paths.report, before)
+    result.publish()
+    now = {"views": {"max_image_size": 384}, "steps": 10, "num_threads": 2}
+    with pytest.raises(InputError, match=r"settings \(max_image_size 0, now 384\); give --overwrite"):
+        open_result(workspace, "two", settings=now)
+    with pytest.raises(InputError, match="from other inputs"):
+        open_result(workspace, "two", settings=before["settings"])
+
+
 def test_a_partial_result_of_other_settings_is_dropped(workspace: Path) -> None:
     result = open_result(workspace, "one")
     result.mark_done("a", {})

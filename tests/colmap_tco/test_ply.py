@@ -178,6 +178,40 @@ def test_visibility_round_trip(tmp_path, images):
     assert np.frombuffer((tmp_path / "c.vis").read_bytes(), "<u4").tolist() == flat
 
 
+def walked(words: np.ndarray) -> list[int]:
+    """Where lists that follow one another begin, one after the other."""
+    heads, at = [], 0
+    while at < len(words):
+        heads.append(at)
+        at += 1 + int(words[at])
+    return heads
+
+
+@pytest.mark.parametrize("longest", [0, 1, 3, 20, 300])
+@pytest.mark.parametrize("points", [1, 2, 99, 2000])
+def test_lists_of_all_lengths_are_read_as_one_after_the_other(tmp_path, points, longest):
+    """Images are as small as counts are, so that a wrong step would go on as a plausible walk."""
+    rng = np.random.default_rng(points + longest)
+    count = rng.integers(0, longest + 1, points)
+    images = rng.integers(0, max(longest, 1), count.sum()).astype(np.uint32)
+    visibility = Visibility(np.concatenate([[0], count.cumsum()]), images)
+    write_vis(tmp_path / "c.vis", visibility)
+    back = read_vis(tmp_path / "c.vis")
+    words = np.frombuffer((tmp_path / "c.vis").read_bytes(), "<u4", offset=8)
+    heads = walked(words)
+    assert np.diff(back.start).tolist() == words[heads].tolist() == count.tolist()
+    assert np.array_equal(back.images, images)
+
+
+@pytest.mark.parametrize("points", [0, 1, 3, 2**60])
+def test_a_wrong_number_of_points_is_an_error(tmp_path, points):
+    write_vis(tmp_path / "c.vis", lists((1, 2), (3,)))
+    data = (tmp_path / "c.vis").read_bytes()
+    (tmp_path / "c.vis").write_bytes(np.uint64(points).tobytes() + data[8:])
+    with pytest.raises(InputError, match="damaged"):
+        read_vis(tmp_path / "c.vis")
+
+
 @pytest.mark.parametrize("cut", [4, 8, 1])
 def test_truncated_visibility_is_an_error(tmp_path, cut):
     write_vis(tmp_path / "c.vis", lists((1, 2), (3,)))

@@ -46,6 +46,21 @@ def test_nearly_as_many_points_as_allowed_stay(most: int) -> None:
     assert 0.9 * most - 2 <= len(kept) <= most
 
 
+@pytest.mark.parametrize("most", [700, 2000, 7999, 12_000])
+def test_of_a_lattice_nearly_as_many_stay_and_are_spread_evenly(most: int) -> None:
+    """Cubes leave an eighth of it, or all: between the two every cube gets more of its points in turn."""
+    side = 25
+    points = np.stack(np.meshgrid(*[np.arange(side)] * 3), -1).reshape(-1, 3).astype(float)
+    kept = thin(points, 0.0, most)
+    assert 0.9 * most <= len(kept) <= most
+    assert (np.diff(kept) > 0).all()
+    assert np.array_equal(kept, thin(points, 0.0, most))
+    octant = (points[kept] >= side / 2) @ [1, 2, 4]
+    share = np.bincount(octant, minlength=8) / len(kept)
+    assert share.min() > 0.7 / 8 and share.max() < 1.4 / 8
+    assert cKDTree(points[kept]).query(points)[0].max() <= np.sqrt(3) * (side**3 / len(kept)) ** (1 / 3)
+
+
 def test_both_limits_hold_together() -> None:
     assert len(thin(uneven(), 0.1, 10_000)) == len(thin(uneven(), 0.1))
     assert len(thin(uneven(), 0.02, 300)) <= 300

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import urllib.request
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -94,6 +95,27 @@ def test_the_sliders_hide_points_and_give_them_back(viewer: Viewer) -> None:
     assert viewer.refresh() == int((viewer.scene.seen == viewer.scene.seen.max()).sum())
     viewer.seen.value = 0
     assert viewer.refresh() == everything
+
+
+def test_the_first_look_is_at_the_scene_whatever_its_size(viewer: Viewer) -> None:
+    """Nearly all of the cloud is in a square picture of the viewer's 75°, between the planes that cut it."""
+    camera, points = viewer.server.initial_camera, viewer.scene.points
+    position, target, away = viewer.scene.overview()
+    assert np.allclose(camera.position, position) and np.allclose(camera.look_at, target)
+    z = (target - position) / away
+    x = np.cross(z, viewer.scene.up)
+    x /= np.linalg.norm(x)
+    local = (points - position) @ np.stack([x, np.cross(z, x), z]).T
+    half = np.tan(np.radians(75 / 2))
+    assert ((np.abs(local[:, :2]) < half * local[:, 2:]).all(1)).mean() > 0.9
+    assert ((local[:, 2] > camera.near) & (local[:, 2] < camera.far)).all()
+    scale = 1e5
+    views = [
+        replace(v, cam_from_world=np.c_[v.cam_from_world[:, :3], scale * v.cam_from_world[:, 3]])
+        for v in viewer.scene.views
+    ]
+    large = replace(viewer.scene, points=scale * points, origin=scale * viewer.scene.origin, views=views)
+    assert np.allclose(large.overview()[0], scale * position, rtol=1e-4)
 
 
 def test_a_quaternion_turns_as_its_matrix_does() -> None:

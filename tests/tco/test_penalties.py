@@ -194,6 +194,22 @@ def test_depth_terms_ignore_scale_and_shift_and_see_the_rest() -> None:
     )
 
 
+def test_dense_depth_in_standard_deviations_is_the_mean_of_the_kernel() -> None:
+    predicted, _, mask = depths()
+    sigma = 0.01 + 0.02 * torch.rand_like(predicted)
+    off = torch.randn_like(predicted)
+    prior = torch.where(mask, predicted * (1 + off * sigma), 1e9)
+    for kernel in ("quadratic", "huber", "cauchy"):
+        value = penalties.depth_uncertain(predicted, prior, mask, sigma, kernel)
+        torch.testing.assert_close(value, robust(off[mask], kernel, 2.0).mean())
+    leaf = predicted.clone().requires_grad_(True)
+    assert torch.autograd.gradcheck(lambda d: penalties.depth_uncertain(d, prior, mask, sigma), (leaf,))
+    with pytest.raises(ValueError, match="must be positive"):
+        penalties.depth_uncertain(predicted, prior, mask, 0 * sigma)
+    with pytest.raises(ValueError, match="empty"):
+        penalties.depth_uncertain(predicted, prior, mask & False, sigma)
+
+
 def test_empty_depth_masks_are_errors() -> None:
     predicted, prior, mask = depths()
     with pytest.raises(ValueError, match="two depths"):

@@ -14,9 +14,9 @@ from torch import Tensor, nn
 from tco.backbones.base import Backbone
 from tco.geometry import rigid, so3_exp
 from tco.optimize import optimize
-from tco.options import TCOConfig
+from tco.options import PolishConfig, TCOConfig
 from tco.penalties import in_first_view, rotation_angle
-from tco.terms import Terms, means
+from tco.terms import ExtraTerm, Terms, means
 from tco.toy import Toy, Wall, wall
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
 
@@ -115,6 +115,82 @@ def test_dense_depth_is_compared_after_one_scale_and_shift(scene: Wall) -> None:
     bent = scene.depth * (1 + 0.1 * torch.linspace(0, 1, 64))
     assert float(of_source(scene, bent, other, depth=1.0)["depth"]) > 0.01
     assert of_source(scene, bent, torch.zeros_like(other), depth=1.0) == {}
+
+
+def test_dense_depth_with_standard_deviations_is_compared_as_it_is(scene: Wall) -> None:
+    """Half a standard deviation costs ½ · ½², and another scale is an error, not aligned away."""
+    assert scene.priors.cameras is not None
+    sigma = torch.full_like(scene.depth, 0.01)
+
+    def term(factor: float) -> float:
+        priors = replace(scene.priors, depth=factor * scene.depth, depth_sigma=sigma)
+        terms = Terms(scene.views, priors, TCOConfig(depth_weight=1.0))
+        now = Prediction(scene.depth, torch.full_like(sigma, 10.0), terms.given, (0, 1, 2, 3))  # type: ignore[arg-type]
+        return float(terms.of_source(1, [], now, now, terms.given, {"depth": 1.0})["depth"])  # type: ignore[arg-type]
+
+    assert term(1.0) < 1e-9
+    assert term(1.005) == pytest.approx(0.125, rel=1e-3)
+    assert term(1.03) == pytest.approx(2 * (3 - 1), rel=1e-3)  # linear beyond two
+
+
+ALONE = TCOConfig(
+    steps=60, rate=0.02, lora_targets=("plane",), photometric_weight=0, consistency_weight=0, sparse_weight=0,
+    camera_rate=0, polish=PolishConfig(polish_steps=0),
+)  # fmt: skip
+"""Nothing but what the caller adds."""
+
+
+def towards(target: Tensor, weight: float = 1.0) -> ExtraTerm:
+    return ExtraTerm("mine", weight, lambda view, depth, cameras: (depth / target[view] - 1).square().mean())
+
+
+def test_an_extra_term_alone_brings_the_network_to_its_minimum(scene: Wall) -> None:
+    """Toward another plane, which the network can say; and the network itself is left as it was."""
+    target, network = wall(slope=0.1, points=20).depth, Toy()
+    before = network.plane.weight.clone()
+    outcome = optimize(network, scene.views, scene.priors, ALONE, extra=[towards(target)])
+    assert outcome.history[0].keys() == {"mine", "loss"}
+    assert outcome.history[-1]["mine"] < 1e-3 * outcome.history[0]["mine"]
+    assert float((outcome.prediction.depth / target - 1).abs().max()) < 0.02
+    assert torch.equal(network.plane.weight, before)
+
+
+def test_an_extra_term_also_refines_the_depths_themselves(scene: Wall) -> None:
+    """Toward depths that the network cannot say: what is left of the error falls in the steps on depths."""
+    target = scene.depth * (1 + 0.02 * torch.linspace(-1, 1, 64).square())
+    config = replace(ALONE, polish=PolishConfig(polish_steps=40, polish_rate=3e-3))
+    plain, refined = (
+        optimize(Toy(), scene.views, scene.priors, c, extra=[towards(target)]) for c in (ALONE, config)
+    )
+    error = [float((o.prediction.depth / target - 1).abs().mean()) for o in (plain, refined)]
+    assert error[1] < 0.5 * error[0]
+    assert all("mine" in step for step in refined.history)
+
+
+def test_an_extra_term_may_be_silent_or_off_and_gives_the_cameras(scene: Wall) -> None:
+    seen = []
+
+    def only_view_two(view: int, depth: Tensor, cameras: Cameras) -> Tensor | None:
+        seen.append((view, tuple(depth.shape), len(cameras)))
+        return depth.mean() if view == 2 else None
+
+    own = ExtraTerm("two", 0.5, only_view_two)
+    terms = Terms(scene.views, scene.priors, ALONE, [own, ExtraTerm("off", 0.0, only_view_two)])
+    assert terms.weights(0, False) == {"two": 0.5}
+    assert terms.given is not None
+    now = Prediction(scene.depth, torch.full_like(scene.depth, 10.0), terms.given, (0, 1, 2, 3))
+    found = [terms.of_source(i, [], now, now, terms.given, terms.weights(0, False)) for i in range(4)]
+    assert [len(part) for part in found] == [0, 0, 1, 0]
+    assert float(found[2]["two"]) == float(scene.depth[2].mean())
+    assert seen == [(i, (48, 64), 4) for i in range(4)]
+
+
+def test_names_and_weights_of_extra_terms_are_checked(scene: Wall) -> None:
+    for name, weight in (("photometric", 1.0), ("loss", 1.0), ("mine", -1.0)):
+        with pytest.raises(ValueError, match="an extra term needs"):
+            ExtraTerm(name, weight, lambda *_: None)
+    with pytest.raises(ValueError, match="extra terms of one name: mine, mine"):
+        Terms(scene.views, scene.priors, ALONE, [towards(scene.depth)] * 2)
 
 
 def test_only_what_has_a_weight_is_there(scene: Wall) -> None:

@@ -1,0 +1,140 @@
+"""A workspace as one problem for :func:`tco.optimize.optimize`, all its views in a single chunk.
+
+    scene = open_scene(Path("workspace"))
+    outcome = optimize(load_sweep(), scene.views, scene.priors)
+    cloud, report = scene.fuse(outcome.prediction)
+
+For experiments on scenes that fit the memory. ``colmap_tco.densify`` does the same in chunks, writes files,
+and goes on after an interruption.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from colmap_tco.chunks import source_views
+from colmap_tco.fusion import FusionConfig, FusionMaps, FusionView, fuse
+from colmap_tco.outputs import ViewMaps, reaches
+from colmap_tco.ply import Cloud
+from colmap_tco.predict import view_maps
+from colmap_tco.priors import PriorConfig, build_priors, chunk_frame, with_points
+from colmap_tco.tracks import Tracks, covisibility, read_tracks
+from colmap_tco.views import ChunkFrame, View, ViewConfig, batch, make_views, undistorted_image
+from colmap_tco.workspace import open_workspace
+
+if TYPE_CHECKING:
+    from colmap_tco._pycolmap import Floats
+    from colmap_tco.fusion_report import FusionReport
+    from tco.types import Prediction, Priors, SparseDepth, Views
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the optimisation takes, and what is needed to go back to COLMAP's frame and units.
+
+    Attributes:
+        images: V views with their cameras in COLMAP's frame.
+        tracks: of the model.
+        frame: the chunk's coordinates: the first camera's, in units of ``frame.scale``.
+        views: the pictures on one canvas.
+        priors: cameras, points and overlap, in the chunk's coordinates.
+        held_out: one ``SparseDepth`` a view, of the points that are not among the priors.
+    """
+
+    images: tuple[View, ...]
+    tracks: Tracks
+    frame: ChunkFrame
+    views: Views
+    priors: Priors
+    held_out: tuple[SparseDepth, ...]
+
+    def maps(self, prediction: Prediction) -> list[ViewMaps]:
+        """Depths in COLMAP units, normals and confidences of all V views, which the prediction is of."""
+        scale, valid = self.frame.scale, self.views.valid
+        return [view_maps(view, prediction, i, valid, scale) for i, view in enumerate(self.images)]
+
+    def fuse(
+        self, prediction: Prediction, config: FusionConfig = FusionConfig()
+    ) -> tuple[Cloud, FusionReport]:
+        """The cloud of a prediction of all V views, in COLMAP's frame.
+
+        Raises:
+            EmptyCloudError: no point is left; the message names the filter that removed most.
+        """
+        pairs = covisibility(self.tracks, [view.image_id for view in self.images])
+        sources = source_views(pairs, config.check_num_images)
+        return fuse(fusion_views(self.images, self.maps(prediction), sources, self.tracks), config)
+
+    def chunk_plane(self, plane: Sequence[float]) -> Floats:
+        """The plane n·X + d = 0 of COLMAP's frame in the chunk's: (4,), its normal of length one.
+
+        Distances from it are in the chunk's unit.
+
+        Args:
+            plane: n and d.
+        """
+        normal, offset = np.asarray(plane[:3], float), float(plane[3])
+        turn, shift = self.frame.cam_from_world[:, :3], self.frame.cam_from_world[:, 3]
+        turned = turn @ normal
+        return np.append(turned, (offset - turned @ shift) / self.frame.scale) / np.linalg.norm(normal)
+
+
+def open_scene(
+    root: Path,
+    config: ViewConfig = ViewConfig(),
+    stride: int = 16,
+    priors: PriorConfig = PriorConfig(),
+    seed: int = 0,
+) -> Scene:
+    """Read a workspace: its best model, undistorted pictures, and priors of all views that have points.
+
+    Args:
+        root: folder with ``images/`` and a model.
+        config: size of the pictures; masks.
+        stride: of the network that will see them.
+        priors: which points are held out.
+        seed: of that choice.
+
+    Raises:
+        InputError: images or model that cannot be used.
+    """
+    workspace = open_workspace(root)
+    images, _ = make_views(workspace, config, stride)
+    tracks = read_tracks(workspace.model)
+    images, _ = with_points(tracks, images, priors, seed)
+    frame = chunk_frame(tracks, images)
+    views, _ = batch(images, frame)
+    known = build_priors(tracks, images, frame, priors, seed)
+    return Scene(tuple(images), tracks, frame, views, known.optimise, known.held_out)
+
+
+def fusion_views(
+    images: Sequence[View], maps: Sequence[ViewMaps], sources: Sequence[Sequence[int]], tracks: Tracks
+) -> list[FusionView]:
+    """V views and their maps, in memory, as :func:`colmap_tco.fusion.fuse` takes them.
+
+    Args:
+        images: the views.
+        maps: of each.
+        sources: of each, the positions of its neighbours: :func:`colmap_tco.chunks.source_views`.
+        tracks: of the model; what lies far behind its points is left out.
+    """
+    reach = reaches(tracks, images)
+
+    def load(i: int) -> FusionMaps:
+        picture, _ = undistorted_image(images[i])
+        return FusionMaps(maps[i].depth, maps[i].normal, picture, maps[i].confidence)
+
+    return [
+        FusionView(
+            view.name, i, view.camera, view.cam_from_world, tuple(sources[i]),
+            load=lambda i=i: load(i),  # type: ignore[misc]
+            reach=reach.get(view.name, np.inf),
+        )
+        for i, view in enumerate(images)
+    ]  # fmt: skip
