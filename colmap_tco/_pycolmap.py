@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import tempfile
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -124,6 +124,26 @@ def _cameras_size(model: Model) -> int:
 def is_spherical(camera: Camera) -> bool:
     """Whether the camera covers directions that no single pinhole can (its focal length does not exist)."""
     return str(camera.model.name) in SPHERICAL
+
+
+def camera(model: str, size: tuple[int, int], params: Sequence[float]) -> Camera:
+    """A camera of COLMAP.
+
+    Args:
+        model: as COLMAP calls it, such as THIN_PRISM_FISHEYE.
+        size: (width, height) in pixels.
+        params: of the model.
+
+    Raises:
+        InputError: no such model, or not its number of parameters.
+    """
+    try:
+        found = load().Camera(model=model, width=size[0], height=size[1], params=list(params))
+    except (ValueError, RuntimeError, TypeError) as error:
+        raise InputError(f"camera model {model} with {len(params)} parameters: {error}") from error
+    if not found.verify_params():
+        raise InputError(f"camera model {model} does not take {len(params)} parameters")
+    return found
 
 
 def camera_size(camera: Camera) -> tuple[int, int]:
