@@ -140,7 +140,7 @@ def camera(model: str, size: tuple[int, int], params: Sequence[float]) -> Camera
     try:
         found = load().Camera(model=model, width=size[0], height=size[1], params=list(params))
     except (ValueError, RuntimeError, TypeError) as error:
-        raise InputError(f"camera model {model} with {len(params)} parameters: {error}") from error
+        raise InputError(f"{model} is no camera model of this pycolmap: {error}") from error
     if not found.verify_params():
         raise InputError(f"camera model {model} does not take {len(params)} parameters")
     return found

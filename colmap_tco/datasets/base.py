@@ -225,6 +225,14 @@ def rigid(matrix: Floats, where: str) -> Floats:
     return pose
 
 
+def inverse(pose: Floats) -> Floats:
+    """The pose (4, 4) the other way round."""
+    R, t = pose[:3, :3], pose[:3, 3]
+    back = np.eye(4)
+    back[:3, :3], back[:3, 3] = R.T, -R.T @ t
+    return back
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) from the header of a picture.
 
@@ -252,6 +260,5 @@ def read_depth_png(path: Path, remedy: str, invalid: Sequence[int] = (0,)) -> De
     raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if raw is None or raw.ndim != 2 or raw.dtype != np.uint16:
         raise InputError(f"{path}: a depth map is a PNG of one 16-bit channel; {remedy}")
-    depth = raw.astype(np.float32) / 1000
-    depth[np.isin(raw, invalid)] = 0
+    depth: Depth = np.where(np.isin(raw, invalid), 0, raw.astype(np.float32) / 1000).astype(np.float32)
     return depth

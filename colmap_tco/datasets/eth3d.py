@@ -6,8 +6,9 @@ Two layouts are read. That of ETH3D's own archives (eth3d.net/documentation; 7-Z
     <root>/<scene>/images/dslr_images_undistorted/DSC_0001.JPG
     <root>/<scene>/dslr_calibration_undistorted/{cameras,images}.txt   COLMAP's text format, PINHOLE
     <root>/<scene>/dslr_calibration_jpg/{cameras,images}.txt           THIN_PRISM_FISHEYE, of the originals
-    <root>/<scene>/ground_truth_depth/dslr_images/DSC_0001.JPG         float32 without a header, metres, infinite
-                                                                       where there is none; pixels of the originals
+    <root>/<scene>/ground_truth_depth/dslr_images/DSC_0001.JPG         float32 without a header, metres,
+                                                                       infinite where there is none, in
+                                                                       pixels of the originals
     <root>/<scene>/dslr_scan_eval/scan_alignment.mlp                   the scans, in the frame of the cameras
 
 and what π³'s ``datasets/preprocess/prepare_eth3d.py`` makes of it, which TCO reads:
@@ -39,6 +40,7 @@ from colmap_tco.datasets.base import (
     folders,
     image_size,
     intrinsics,
+    inverse,
     pixel_centres,
     rays,
     rigid,
@@ -138,16 +140,17 @@ def _prepared(root: Path, picture: Path) -> Frame:
             f"{file}: no arrays 'intrinsics' and 'extrinsics' in it ({error}); {REMEDY}"
         ) from error
     size, depth = image_size(picture), root / "ground_truth_depth" / _PREPARED / picture.name
-    world_from_cam = np.linalg.inv(rigid(cam_from_world, str(file)))
+    world_from_cam = inverse(rigid(cam_from_world, str(file)))
     return Frame(picture.stem, picture, size, world_from_cam, K, lambda: read_depth(depth, size))
 
 
 def _undistorted(root: Path, picture: Path, calibration: dict[str, Calibrated]) -> Frame:
     """A frame of ETH3D's undistorted pictures."""
-    entry = _entry(calibration, picture.name, root / "dslr_calibration_undistorted")
-    if entry.model != "PINHOLE":
+    folder = root / "dslr_calibration_undistorted"
+    entry = _entry(calibration, picture.name, folder)
+    if entry.model != "PINHOLE" or len(entry.params) != 4:
         raise InputError(
-            f"{root / 'dslr_calibration_undistorted'}: {entry.model} cameras where PINHOLE is due"
+            f"{folder}: a camera {entry.model} of {len(entry.params)} numbers where PINHOLE is due"
         )
     size = image_size(picture)
     if size != entry.size:
@@ -156,7 +159,7 @@ def _undistorted(root: Path, picture: Path, calibration: dict[str, Calibrated]) 
             "do not resize"
         )
     K, name = intrinsics(*entry.params), picture.name
-    world_from_cam = np.linalg.inv(entry.cam_from_world)
+    world_from_cam = inverse(entry.cam_from_world)
     return Frame(
         picture.stem, picture, size, world_from_cam, K, lambda: _undistorted_depth(root, name, K, size)
     )
