@@ -20,6 +20,9 @@ logger = logging.getLogger(__name__)
 COMPATIBILITY = frozenset({"photometric", "geometric", "consistency"})
 """Terms that compare a view with others."""
 
+HELD = {"rotation": penalties.rotation, "translation": penalties.translation, "focal": penalties.focal}
+"""Terms that hold the cameras that a network predicts."""
+
 
 class Terms:
     """Terms of the views of one chunk, with what is known of them.
@@ -36,6 +39,9 @@ class Terms:
             ValueError: it has not.
         """
         self.views, self.config, self.given, self.depth = views, config, priors.cameras, priors.depth
+        self.held = priors.held
+        if self.held is not None and self.given is not None:
+            raise ValueError("cameras are given, so that there are none of the network's own to be held")
         if config.depth_weight > 0 and priors.depth is None:
             raise ValueError("depth_weight is set and there is no dense depth among the priors")
         if self.given is None:
@@ -72,6 +78,8 @@ class Terms:
             "depth": c.depth_weight,
             "cameras": cameras if movable else 0.0,
         }
+        if self.held is not None:
+            every |= {name: getattr(self.held, name) for name in HELD}
         return {name: weight for name, weight in every.items() if weight > 0}
 
     def of_source(
@@ -95,6 +103,7 @@ class Terms:
             terms["sparse"] = penalties.sparse_depth(depth, self.sparse[source])
         if "depth" in weights:
             terms |= self._depth(prediction)
+        terms |= self._held(prediction.cameras, weights)
         if not targets:
             return terms
         try:
@@ -111,6 +120,15 @@ class Terms:
         if int(mask.sum()) < 2:
             return {}
         return {"depth": penalties.depth(prediction.depth, self.depth[chosen], mask)}
+
+    def _held(self, ours: Cameras, weights: Mapping[str, float]) -> dict[str, Tensor]:
+        """Penalties on the network's own cameras (arXiv 2604.03878, section 3.2.2)."""
+        if self.held is None:
+            return {}
+        theirs = self.held.cameras
+        pairs = {"focal": (ours.K, theirs.K)}
+        pairs["rotation"] = pairs["translation"] = (ours.world_from_cam, theirs.world_from_cam)
+        return {name: HELD[name](*pairs[name]) for name in HELD if name in weights}
 
     def _compatibility(
         self, source: int, targets: list[int], prediction: Prediction, context: Prediction,

@@ -115,6 +115,23 @@ class SparseDepth(_Movable):
 
 
 @dataclass(frozen=True)
+class HeldCameras(_Movable):
+    """Cameras that a network's own are held to by the paper's penalties; a weight of 0 leaves a part free.
+
+    Attributes:
+        cameras: what is known, in any world and scale.
+        rotation: weight of the mean angle between rotations relative to the first view, radians.
+        translation: weight of the mean L1 of centres relative to the first view, normalised by distance.
+        focal: weight of the mean L1 of focal lengths, pixels.
+    """
+
+    cameras: Cameras
+    rotation: float = 1.0
+    translation: float = 2.0
+    focal: float = 0.01
+
+
+@dataclass(frozen=True)
 class Priors(_Movable):
     """What is known about the views beside their pixels; None where it is not known.
 
@@ -126,6 +143,8 @@ class Priors(_Movable):
         rotation_sigma: (V,) standard deviation of the pose prior's rotation, radians.
         centre_sigma: (V,) standard deviation of the camera centre, in units of length.
         focal_sigma: (V,) standard deviation of the relative focal length.
+        held: for networks that predict their cameras and are to keep predicting them, without ``cameras``:
+            what these are held to.
     """
 
     cameras: Cameras | None = None
@@ -135,6 +154,7 @@ class Priors(_Movable):
     rotation_sigma: Tensor | None = None
     centre_sigma: Tensor | None = None
     focal_sigma: Tensor | None = None
+    held: HeldCameras | None = None
 
 
 @dataclass(frozen=True)

@@ -165,7 +165,7 @@ FISHEYE = (150.0, 149.0, 81.0, 59.0, 0.05, -0.02, 0.002, -0.001, 0.01, 0.002, 0.
 
 
 def eth3d(root: Path, count: int = 3, scene: str = "courtyard") -> list[Camera]:
-    """ETH3D's own archives: depth in the pixels of the distorted pictures, infinite in their first row."""
+    """ETH3D's own archives: depth in the pixels of the distorted pictures, infinite in a patch."""
     base, found, images = root / scene, [], []
     distorted = _pycolmap.camera("THIN_PRISM_FISHEYE", (160, 120), FISHEYE)
     x, y = np.meshgrid(np.arange(160) + 0.5, np.arange(120) + 0.5)
@@ -175,7 +175,7 @@ def eth3d(root: Path, count: int = 3, scene: str = "courtyard") -> list[Camera]:
         picture(base / "images" / "dslr_images_undistorted" / name, camera.size, camera.pixel(DOT))
         ray = np.concatenate([rays, np.ones((120, 160, 1))], -1)
         depth = (OFFSET - NORMAL @ pose[:3, 3]) / (ray @ pose[:3, :3].T @ NORMAL)
-        depth[0] = np.inf
+        depth[40:44, 60:70] = np.inf
         path = base / "ground_truth_depth" / "dslr_images" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         depth.astype("<f4").tofile(path)

@@ -96,7 +96,7 @@ def test_holes_are_zero_and_nothing_is_negative_or_infinite(
         assert depth.dtype == np.float32
         assert np.isfinite(depth).all() and (depth >= 0).all() and (depth < 10.001).all()
         assert (depth == 0).any()
-        outside = np.array([[-1.0, 5.0], [frame.size[0] + 0.5, 5.0], [5.0, -1.0]])
+        outside = np.array([[-1e4, 5.0], [1e4, 5.0], [5.0, -1e4], [5.0, 1e4]])
         assert not frame.depth_at(outside).any()
 
 
@@ -202,7 +202,7 @@ def missing(root: Path, file: str) -> Path:
         ("eth3d", "courtyard/dslr_calibration_undistorted/images.txt", "the poses"),
         ("eth3d", "courtyard/dslr_calibration_jpg/cameras.txt", "the calibration"),
         ("eth3d", "courtyard/ground_truth_depth/dslr_images/DSC_0287.JPG", "the true depth"),
-        ("scannet", "scene0707_00/pose/1.txt", "the pose"),
+        ("scannet", "scene0707_00/pose/3.txt", "the pose"),
         ("scannet", "scene0707_00/intrinsic/intrinsic_depth.txt", "the intrinsics"),
     ],
 )  # fmt: skip
