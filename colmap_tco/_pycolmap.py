@@ -419,7 +419,7 @@ def triangulate(root: Path, pictures: Sequence[PosedPicture], seed: int, threads
     )
     if not len(found.points3D):
         raise InputError(
-            f"{images}: COLMAP found no point that two of the {len(pictures)} pictures show; take frames that "
-            "overlap more, or a network that needs no points"
+            f"{images}: COLMAP found no point that two of the {len(pictures)} pictures show; take frames "
+            "that overlap more, or a network that needs no points"
         )
     found.write(str(output))

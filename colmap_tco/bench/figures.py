@@ -14,8 +14,9 @@ from colmap_tco.evaluation.points import compare_clouds
 from colmap_tco.evaluation.trajectory import trajectory_figures
 
 POINTS = {
-    "acc_mean": "accuracy_mean", "acc_med": "accuracy_median", "comp_mean": "completion_mean",
-    "comp_med": "completion_median", "nc_mean": "normal_consistency_mean", "nc_med": "normal_consistency_median",
+    "acc_mean": "accuracy_mean", "acc_med": "accuracy_median",
+    "comp_mean": "completion_mean", "comp_med": "completion_median",
+    "nc_mean": "normal_consistency_mean", "nc_med": "normal_consistency_median",
 }  # fmt: skip
 """Column → attribute of :class:`colmap_tco.evaluation.points.CloudFigures`."""
 

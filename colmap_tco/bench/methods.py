@@ -183,12 +183,11 @@ def _with_heads(network: Any) -> Backbone:
     if not isinstance(inner, nn.Module):
         return network
     inside = {id(module) for module in network.decoder().modules()}
+    unused = ("point_head",) if network.name == "vggt" else ()
     heads = {
         name: module
         for name, module in inner.named_children()
-        if name.endswith("head")
-        and id(module) not in inside
-        and not (network.name == "vggt" and "point" in name)
+        if name.endswith("head") and id(module) not in inside and name not in unused
     }
     return _WithHeads(network, nn.ModuleDict(heads)) if heads else network
 

@@ -21,11 +21,11 @@ MEANING = {
     "depth": "optimised with the depths alone",
     "no-compatibility": "as tco, without comparing views: the priors' penalties alone",
     "rank=N": "as tco, with adapters of this rank; the paper has 1, 4 and 16",
-    "radius=X": "as tco, with surfels of this radius, in steps between neighbouring points; the paper has 0.5",
+    "radius=X": "as tco, with surfels of this radius, in steps between points; the paper tries 0.05 to 5",
     "heads": "as tco, with the network's heads trained in full beside the adapters",
-    "surfels": "depths, radii and orientations of the surfels optimised in place of the network, from raw-depth",
+    "surfels": "from raw-depth, the surfels' depths, radii and turns optimised in place of the network",
     "steps=N": "as tco, with so many steps; the paper's curve has 0 to 80",
-    "noise=R/T/F": "as tco, with priors that are wrong by R degrees, T of the centres' spread, F of the focals",
+    "noise=R/T/F": "as tco, priors wrong by R degrees, a share T of the centres' spread, F of focal lengths",
 }
 """Row → what it is. N, X, R, T and F are numbers."""
 
