@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+TAKE_CAMERAS = ("sweep",)
+"""Kinds of networks whose cameras are input, for which TCO's settings were not made."""
+
 DATASETS = ("eth3d", "dtu", "7scenes", "nrgbd", "scannet")
 
 
@@ -36,8 +39,8 @@ class BenchConfig:
     root: Path | None = knob(None, "its folder, in the layout in which it is published, see docs/bench.md")
     setting: str = knob(
         "",
-        "which frames: sparse or dense for 7scenes and nrgbd, stride1, stride4 or stride16 for scannet; empty: "
-        "that of the paper's tables, the first of these",
+        "which frames: sparse or dense for 7scenes and nrgbd, stride1, stride4 or stride16 for scannet; "
+        "empty: the first of these",
     )
     scenes: tuple[str, ...] = knob((), "scenes, such as courtyard or chess/seq-03; empty: all")
     rows: tuple[str, ...] = knob(
@@ -52,8 +55,8 @@ class BenchConfig:
     )
     published_settings: bool = knob(
         True,
-        "steps, rate and weights of TCO's scripts for the dataset where they were left alone, on its schedule; "
-        "off: what densify would do. Networks that take cameras have no published settings",
+        "steps, rate and weights of TCO's scripts for the dataset where they were left alone, on its "
+        "schedule; off: what densify would do, as always for networks that take cameras as input",
     )
     as_published: bool = knob(
         True,
@@ -254,7 +257,7 @@ def _row(run: _Run, network: Backbone, scene: str, prepared: Any, row: Row) -> R
 def _tco(run: _Run) -> TCOConfig:
     """The settings of the optimisation before rows change them."""
     own = suited(run.config.tco, run.chosen.network)
-    if not run.config.published_settings or run.chosen.network.name == "sweep":
+    if not run.config.published_settings or run.chosen.network.kind in TAKE_CAMERAS:
         return own
     return published_schedule(run.config.dataset, run.config.tco)
 
@@ -285,12 +288,13 @@ def _about(run: _Run, rows: Sequence[Row]) -> list[str]:
     return [
         f"# {run.config.dataset}, {run.setting}, {run.chosen.network.name}",
         f"{what}; means over scenes. Weights: {run.chosen.weights.name}. Priors: "
-        f"{', '.join(_priors(run.config))}. {config.steps} steps at a rate of {config.rate:g} where a row does "
-        f"not say otherwise, seed {run.config.seed}.",
+        f"{', '.join(_priors(run.config))}. {config.steps} steps at a rate of {config.rate:g} where a row "
+        f"does not say otherwise, seed {run.config.seed}.",
         f"Rows: {told}.",
     ]
 
 
 def _kind(name: str) -> str:
     """``rank=N`` of ``rank=16``."""
-    return next((key for key in MEANING if key.split("=")[0] == name.split("=")[0]), name)
+    kind = name.partition("=")[0]
+    return next((key for key in MEANING if key.partition("=")[0] == kind), name)
