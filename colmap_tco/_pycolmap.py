@@ -388,38 +388,15 @@ def run_mapper(inputs: tuple[Path, Path], output: Path, use_global: bool, thread
     return sum(len(model.points3D) > 0 for model in models.values())
 
 
-PosedPicture: TypeAlias = tuple[int, str, tuple[int, int, float, float, float, float], Floats]
-"""Id, name, (width, height, fx, fy, cx, cy), cam_from_world (3, 4)."""
+def triangulate_points(model: Model, inputs: tuple[Path, Path], output: Path, threads: int) -> int:
+    """Write to ``output`` a model with the cameras of ``model`` and points, and return their number.
 
-
-def triangulate(root: Path, pictures: Sequence[PosedPicture], seed: int, threads: int = -1) -> None:
-    """Triangulate points between the pictures of ``root``/images, whose cameras are known and stay.
-
-    Features are matched between all pairs. ``root``/database.db and the model ``root``/sparse/0 are written.
-
-    Raises:
-        InputError: no point is seen by two pictures.
+    ``inputs`` are a database with matches, whose images, cameras and ids are those of the model, and the
+    image folder.
     """
-    database, images, output = root / "database.db", root / "images", root / "sparse" / "0"
-    database.unlink(missing_ok=True)
-    output.mkdir(parents=True, exist_ok=True)
-    names = [name for _, name, _, _ in pictures]
-    extract_features(database, images, names, share_camera=False, threads=threads, seed=seed)
-    match(database, threads, seed)
-    none = (np.zeros((0, 2)), np.zeros(0, np.int64))
-    posed = [
-        PinholeImage(Registered(key, name, None, pose), camera, *none) for key, name, camera, pose in pictures
-    ]
-    nothing = (np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    pycolmap = load()
-    options = pycolmap.IncrementalPipelineOptions()
+    options = load().IncrementalPipelineOptions()
     options.num_threads = threads
-    found = pycolmap.triangulate_points(
-        pinhole_model(posed, nothing), str(database), str(images), str(output), options=options
-    )
-    if not len(found.points3D):
-        raise InputError(
-            f"{images}: COLMAP found no point that two of the {len(pictures)} pictures show; take frames "
-            "that overlap more, or a network that needs no points"
-        )
-    found.write(str(output))
+    paths = [str(path) for path in (*inputs, output)]
+    found = load().triangulate_points(model, *paths, options=options)
+    found.write(paths[-1])
+    return len(found.points3D)

@@ -133,9 +133,7 @@ def triangulated(scene: Scene, width: int, stride: int, folder: Path, seed: int 
     Raises:
         InputError: too few features match between the pictures for COLMAP to triangulate points.
     """
-    import torch
-
-    from colmap_tco import _pycolmap
+    from colmap_tco.bench.triangulate import Picture, triangulate
     from colmap_tco.priors import PriorConfig, build_priors, chunk_frame, with_points
     from colmap_tco.tracks import read_tracks
     from colmap_tco.views import ViewConfig, batch, make_views, original_from_network
@@ -143,7 +141,11 @@ def triangulated(scene: Scene, width: int, stride: int, folder: Path, seed: int 
 
     frames = {f"{i:05d}{frame.image.suffix}": frame for i, frame in enumerate(scene.frames)}
     _copy_pictures(frames, folder / "images")
-    _pycolmap.triangulate(folder, [_entry(i, name, f) for i, (name, f) in enumerate(frames.items(), 1)], seed)
+    pictures = [
+        Picture(name, Pinhole(*f.size, *_focal_and_centre(f)), inverse(f.world_from_cam)[:3])
+        for name, f in frames.items()
+    ]
+    triangulate(folder, pictures, seed)
     workspace = open_workspace(folder)
     found, skipped = make_views(workspace, ViewConfig(max_image_size=width), stride)
     tracks = read_tracks(workspace.model)
@@ -162,7 +164,6 @@ def triangulated(scene: Scene, width: int, stride: int, folder: Path, seed: int 
         xy = pixel_centres(wide, height) - (left, top)
         depth[i] = frames[view.name].depth_at(original_from_network(view, xy)).reshape(height, wide)
     poses = np.stack([frames[view.name].world_from_cam for view in views])
-    assert isinstance(images.images, torch.Tensor)
     return Prepared(images, cameras, poses, K, depth, frame.scale, priors)
 
 
@@ -170,11 +171,3 @@ def _copy_pictures(frames: dict[str, Frame], folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name, frame in frames.items():
         shutil.copyfile(frame.image, folder / name)
-
-
-def _entry(
-    image_id: int, name: str, frame: Frame
-) -> tuple[int, str, tuple[int, int, float, float, float, float], Floats]:
-    """A picture as :func:`colmap_tco._pycolmap.triangulate` takes it."""
-    camera = (*frame.size, *_focal_and_centre(frame))
-    return image_id, name, camera, inverse(frame.world_from_cam)[:3]

@@ -73,9 +73,7 @@ def read_result(
         saved = json.loads(path.read_text("utf-8"))
         old, result = saved["settings"], Result(**saved["result"])
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{path}: not a result of this command ({error}); remove it, or --overwrite"
-        ) from error
+        raise InputError(f"{path}: no result of this command ({error}); remove it, or --overwrite") from error
     if saved["fingerprint"] != fingerprint({**settings, "format": FORMAT}, (), ()):
         changed = sorted(k for k in {*old, *settings} if old.get(k) != json.loads(_json(settings.get(k))))
         raise InputError(

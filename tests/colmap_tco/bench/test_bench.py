@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,22 +19,21 @@ from colmap_tco.progress import Progress
 from tco.backbones.checkpoints import save
 from tco.options import TCOConfig
 from tests.colmap_tco.datasets import layouts
+from tests.conftest import Room
 from tests.tco.published import TINY_VGGT, tiny_vggt
-from training.scenes import Sample, walk
+from training.scenes import Sample
 
 COLUMNS = ("acc_mean", "acc_med", "comp_mean", "comp_med", "nc_mean", "nc_med")
 
 
-def write_room(root: Path, sample: Sample, scene: str, every: int) -> None:
-    """A rendered room as NRGBD has it, its views ``every`` frames apart; those between are copies."""
+def write_room(root: Path, sample: Sample, scene: str) -> None:
+    """A rendered room as NRGBD has it."""
     rows = []
-    for i in range((len(sample.images) - 1) * every + 1):
-        view = i // every
-        for folder in ("images", "depth"):
-            (root / scene / folder).mkdir(parents=True, exist_ok=True)
-        assert cv2.imwrite(str(root / scene / "images" / f"img{i}.png"), sample.images[view][..., ::-1])
-        layouts.millimetres(root / scene / "depth" / f"depth{i}.png", sample.depth[view])
-        rows.append(np.linalg.inv(sample.cam_from_world[view].astype(float)) @ layouts.GL)
+    for i, (image, depth) in enumerate(zip(sample.images, sample.depth, strict=True)):
+        (root / scene / "images").mkdir(parents=True, exist_ok=True)
+        assert cv2.imwrite(str(root / scene / "images" / f"img{i}.png"), image[..., ::-1])
+        layouts.millimetres(root / scene / "depth" / f"depth{i}.png", depth)
+        rows.append(np.linalg.inv(sample.cam_from_world[i].astype(float)) @ layouts.GL)
     layouts.matrix(root / scene / "poses.txt", np.concatenate(rows))
     layouts.text(root / scene / "focal.txt", f"{sample.K[0, 0, 0]}\n")
 
@@ -47,10 +47,10 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two rooms of four views."""
+    """A scene of four views and one of three."""
     root = tmp_path_factory.mktemp("nrgbd")
-    for seed, name in ((4, "kitchen"), (5, "staircase")):
-        write_room(root, walk(seed, 4, (48, 64)), name, 1)
+    layouts.nrgbd(root, 4)
+    layouts.nrgbd(root, 3, "staircase")
     return root
 
 
@@ -81,23 +81,29 @@ ROWS = ("base", "raw-depth", "tco", "pose", "intrinsics", "no-compatibility", "r
         "radius=2", "heads", "surfels", "steps=0", "noise=3/0.05/0.05")  # fmt: skip
 
 
-def test_all_rows_run_and_the_tables_hold_their_means(config: BenchConfig) -> None:
-    done = bench(replace(config, rows=ROWS), Progress())
-    rows, scenes = table(config), table(config, "scenes")
-    assert tuple(rows) == ROWS
-    assert set(scenes) == {f"{row}, {scene}" for row in ROWS for scene in ("kitchen", "staircase")}
-    for row, line in rows.items():
-        for column in COLUMNS:
-            values = [float(scenes[f"{row}, {scene}"][column]) for scene in ("kitchen", "staircase")]
-            assert float(line[column]) == pytest.approx(np.mean(values), abs=6e-4)
-            assert 0 < float(line[column]) < (1 if column.startswith("nc") else 10)
-    # Rows that compute the same are the same, and the others are not.
-    figures = {row: tuple(line[c] for c in COLUMNS) for row, line in rows.items()}
-    assert figures["base"] == figures["steps=0"]
-    others = [figures[row] for row in ROWS if row != "steps=0"]
+def figures(config: BenchConfig, row: str, scene: str) -> dict[str, float]:
+    path = config.output / "nrgbd-sparse-vggt" / row.replace("/", "_") / f"{scene}.json"
+    found: dict[str, float] = json.loads(path.read_text())["result"]["figures"]
+    return found
+
+
+def test_all_rows_run_and_differ_where_they_should(config: BenchConfig) -> None:
+    bench(replace(config, rows=ROWS, scenes=("kitchen",), tco=TCOConfig(steps=1, rate=0.01)), Progress())
+    assert tuple(table(config)) == ROWS
+    found = {row: tuple(figures(config, row, "kitchen").values()) for row in ROWS}
+    assert all(np.isfinite(values).all() and min(values) > 0 for values in found.values())
+    assert found["base"] == found["steps=0"]
+    others = [found[row] for row in ROWS if row != "steps=0"]
     assert len(set(others)) == len(others)
-    text = done.table.read_text()
+
+
+def test_the_tables_hold_the_means_over_scenes_beside_the_published_figures(config: BenchConfig) -> None:
+    done = bench(replace(config, rows=("base", "raw-depth")), Progress())
+    rows, text = table(config), done.table.read_text()
     for row, line in rows.items():
+        each = [figures(config, row, scene) for scene in ("kitchen", "staircase")]
+        for column in COLUMNS:
+            assert float(line[column]) == pytest.approx(np.mean([f[column] for f in each]), abs=6e-4)
         assert f"| {row} | {' | '.join(line[c] for c in COLUMNS)} | 2 of 2 |" in text
     assert "| *VGGT, published* | 0.051 | 0.029 | 0.066 | 0.038 | 0.890 | 0.981 |" in text
     assert "| *TCO-VGGT, published* | not available here |" in text
@@ -127,8 +133,8 @@ def test_finished_scenes_are_kept_and_other_settings_are_an_error(config: BenchC
 
 def test_a_scene_that_fails_has_a_reason_and_the_others_figures(config: BenchConfig, tmp_path: Path) -> None:
     root = tmp_path / "broken"
-    for seed, name in ((4, "kitchen"), (5, "staircase")):
-        write_room(root, walk(seed, 3, (48, 64)), name, 1)
+    for name in ("kitchen", "staircase"):
+        layouts.nrgbd(root, 3, name)
     (root / "staircase" / "depth" / "depth1.png").unlink()
     broken = replace(config, root=root, rows=("base",))
     with pytest.raises(PartlyDoneError, match=r"1 scenes without figures.*depth1\.png"):
@@ -137,7 +143,7 @@ def test_a_scene_that_fails_has_a_reason_and_the_others_figures(config: BenchCon
     assert scenes["base, kitchen"]["acc_mean"] and not scenes["base, staircase"]["acc_mean"]
     assert "depth1.png" in scenes["base, staircase"]["failed"]
     assert "1 of 2" in (config.output / "nrgbd-sparse-vggt" / "table.md").read_text()
-    layouts.millimetres(root / "staircase" / "depth" / "depth1.png", walk(5, 3, (48, 64)).depth[1])
+    shutil.copy(root / "kitchen/depth/depth1.png", root / "staircase/depth/depth1.png")
     bench(broken, Progress())
     assert table(config, "scenes")["base, staircase"]["acc_mean"]
 
@@ -174,19 +180,23 @@ def test_poses_from_depths_on_scannet(config: BenchConfig, tmp_path: Path) -> No
     assert done.table.parent.name == "scannet-stride1-vggt"
     lines = list(csv.DictReader((done.table.parent / "scenes.csv").read_text().splitlines()))
     assert [line["views"] for line in lines] == ["6"] * 3
-    assert len({line["ate"] for line in lines}) == 3 and all(float(line["rpe_rot"]) > 0 for line in lines)
+    assert all(float(line["rpe_rot"]) > 0 for line in lines)
+    found = [
+        json.loads(path.read_text())["result"]["figures"]["ate"] for path in done.table.parent.rglob("*.json")
+    ]
+    assert len(set(found)) == 3
     with pytest.raises(InputError, match="poses are measured"):
         bench(replace(scannet, rows=("pose",)), Progress())
 
 
 def test_the_embedded_network_reconstructs_a_room_from_prior_cameras_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its points are triangulated from the pictures, and it comes closer than a flat guess would."""
     from colmap_tco.datasets import CHOICES, Choice
 
     monkeypatch.setitem(CHOICES, "nrgbd", {"sparse": Choice(1)})
-    write_room(tmp_path / "n", walk(4, 5, (240, 320)), "kitchen", 1)
+    write_room(tmp_path / "n", room.sample, "kitchen")
     config = BenchConfig(
         dataset="nrgbd",
         root=tmp_path / "n",
