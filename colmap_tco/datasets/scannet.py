@@ -136,5 +136,5 @@ def _check(K: Floats, size: tuple[int, int], root: Path, picture: Path) -> None:
     if off.max() > 0.1:
         raise InputError(
             f"{picture}: {size[0]}×{size[1]} pixels, which {root / 'intrinsic' / 'intrinsic_color.txt'} "
-            f"with its principal point ({K[0, 2]:.0f}, {K[1, 2]:.0f}) is not of; export the pictures in their own size"
+            f"with its principal point ({K[0, 2]:.0f}, {K[1, 2]:.0f}) is not of; export them in full size"
         )

@@ -47,10 +47,14 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scene of four views and one of three."""
+    """A scene of four views and one of three, with some texture for the views to be compared by."""
     root = tmp_path_factory.mktemp("nrgbd")
     layouts.nrgbd(root, 4)
     layouts.nrgbd(root, 3, "staircase")
+    g = np.random.default_rng(0)
+    for path in sorted(root.rglob("img*.png")):
+        coarse = g.integers(0, 255, (9, 12, 3), np.uint8)
+        assert cv2.imwrite(str(path), cv2.resize(coarse, (160, 120), interpolation=cv2.INTER_CUBIC))
     return root
 
 
@@ -77,7 +81,7 @@ def table(config: BenchConfig, name: str = "table") -> dict[str, dict[str, str]]
     return {f"{line['row']}, {line['scene']}" if "scene" in line else line["row"]: line for line in lines}
 
 
-ROWS = ("base", "raw-depth", "tco", "pose", "intrinsics", "no-compatibility", "rank=1", "rank=16",
+ROWS = ("base", "raw-depth", "tco", "pose", "intrinsics", "no-compatibility", "rank=1",
         "radius=2", "heads", "surfels", "steps=0", "noise=3/0.05/0.05")  # fmt: skip
 
 
@@ -88,7 +92,7 @@ def figures(config: BenchConfig, row: str, scene: str) -> dict[str, float]:
 
 
 def test_all_rows_run_and_differ_where_they_should(config: BenchConfig) -> None:
-    bench(replace(config, rows=ROWS, scenes=("kitchen",), tco=TCOConfig(steps=1, rate=0.01)), Progress())
+    bench(replace(config, rows=ROWS, scenes=("kitchen",), tco=TCOConfig(steps=2, rate=0.01)), Progress())
     assert tuple(table(config)) == ROWS
     found = {row: tuple(figures(config, row, "kitchen").values()) for row in ROWS}
     assert all(np.isfinite(values).all() and min(values) > 0 for values in found.values())
