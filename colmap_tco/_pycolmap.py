@@ -127,12 +127,7 @@ def is_spherical(camera: Camera) -> bool:
 
 
 def camera(model: str, size: tuple[int, int], params: Sequence[float]) -> Camera:
-    """A camera of COLMAP.
-
-    Args:
-        model: as COLMAP calls it, such as THIN_PRISM_FISHEYE.
-        size: (width, height) in pixels.
-        params: of the model.
+    """A camera of a model of COLMAP, such as THIN_PRISM_FISHEYE, of this (width, height) in pixels.
 
     Raises:
         InputError: no such model, or not its number of parameters.
