@@ -215,9 +215,10 @@ def _scene(run: _Run, network: Backbone, scene: str, rows: Sequence[Row]) -> lis
     if not rows:
         return []
     width = run.config.image_width or (run.chosen.network.image_size if network.uses_cameras else 518)
-    frames = run.choice.frames(run.dataset.count(scene))
+    frames: list[int] = []
     with TemporaryDirectory(prefix="colmap-tco-bench-") as folder:
         try:
+            frames = run.choice.frames(run.dataset.count(scene))
             read = run.dataset.read(scene, frames)
             prepared: Prepared = (
                 triangulated(read, width, network.stride, Path(folder), run.config.seed)

@@ -76,6 +76,10 @@ def reconstruct(
     """
     check_row(network, row)
     config, cameras = row.config(config), row.noise.cameras(scene.cameras, seed)
+    if "depth" in row.priors and config.steps and not config.depth_weight:
+        raise InputError(
+            f"--rows {row.name} has depths as priors, which count for nothing: give --depth_weight"
+        )
     backbone = _with_heads(network) if row.heads else network
     if row.heads:
         config = _heads(config, backbone)

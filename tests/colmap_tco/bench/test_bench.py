@@ -189,6 +189,8 @@ def test_poses_from_depths_on_scannet(config: BenchConfig, tmp_path: Path) -> No
         json.loads(path.read_text())["result"]["figures"]["ate"] for path in done.table.parent.rglob("*.json")
     ]
     assert len(set(found)) == 3
+    with pytest.raises(InputError, match="give --depth_weight"):
+        bench(replace(scannet, rows=("tco",), published_settings=False, overwrite=True), Progress())
     with pytest.raises(InputError, match="poses are measured"):
         bench(replace(scannet, rows=("pose",)), Progress())
 
