@@ -195,6 +195,7 @@ def test_poses_from_depths_on_scannet(config: BenchConfig, tmp_path: Path) -> No
         bench(replace(scannet, rows=("pose",)), Progress())
 
 
+@pytest.mark.slow
 def test_the_embedded_network_reconstructs_a_room_from_prior_cameras_alone(
     room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -216,7 +217,7 @@ def test_the_embedded_network_reconstructs_a_room_from_prior_cameras_alone(
     folder = tmp_path / "out" / "nrgbd-sparse-sweep"
     lines = {line["row"]: line for line in csv.DictReader((folder / "table.csv").read_text().splitlines())}
     for line in lines.values():
-        assert float(line["acc_med"]) < 0.05 and float(line["comp_med"]) < 0.05
-        assert float(line["nc_mean"]) > 0.6
+        assert float(line["acc_med"]) < 0.1 and float(line["comp_med"]) < 0.1
+        assert float(line["nc_mean"]) > 0.55
     with pytest.raises(InputError, match="sweep takes poses and intrinsics as input"):
         bench(replace(config, rows=("base",)), Progress())
