@@ -16,60 +16,14 @@ weighted    cameras may move and are held by their standard deviations, with a r
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-
-import torch
+from dataclasses import replace
 
 from benchmarks.real import RealSet, arguments, load, publish, within
+from colmap_tco.bench.noise import Noise
 from tco.backbones.weights import EMBEDDED, load_sweep
-from tco.geometry import rigid, so3_exp
 from tco.optimize import Outcome, optimize
 from tco.options import AblationConfig, TCOConfig
 from tco.penalties import in_first_view, rotation_angle
-from tco.types import Cameras, Priors
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Standard deviations: degrees of rotation, shares of the distance of centres and of the focal length."""
-
-    rotation: float = 0.0
-    translation: float = 0.0
-    focal: float = 0.0
-
-    def __str__(self) -> str:
-        parts = []
-        if self.rotation:
-            parts.append(f"rotation {self.rotation:g}°")
-        if self.translation:
-            parts.append(f"translation {100 * self.translation:g} %")
-        if self.focal:
-            parts.append(f"focal {100 * self.focal:g} %")
-        return ", ".join(parts) or "none"
-
-    def __call__(self, priors: Priors, seed: int) -> Priors:
-        """Priors with cameras that are wrong by this much, and know it."""
-        cameras = priors.cameras
-        assert cameras is not None and priors.rotation_sigma is not None
-        assert priors.centre_sigma is not None and priors.focal_sigma is not None
-        v, g = len(cameras), torch.Generator().manual_seed(seed)
-        axis, way = torch.nn.functional.normalize(torch.randn(2, v, 3, generator=g), dim=-1)
-        angle, shift, zoom = torch.randn(3, v, 1, generator=g)
-        centre = cameras.world_from_cam[:, :3, 3]
-        unit = float((centre - centre.mean(0)).norm(dim=-1).mean())
-        R = cameras.world_from_cam[:, :3, :3] @ so3_exp(math.radians(self.rotation) * angle * axis)
-        K = cameras.K.clone()
-        K[:, [0, 1], [0, 1]] *= torch.exp(self.focal * zoom)
-        # A normal length in a random direction has a third of its variance along each axis.
-        third = math.sqrt(1 / 3)
-        return replace(
-            priors,
-            cameras=Cameras(rigid(R, centre + self.translation * unit * shift * way), K),
-            rotation_sigma=priors.rotation_sigma.hypot(torch.tensor(third * math.radians(self.rotation))),
-            centre_sigma=priors.centre_sigma.hypot(torch.tensor(third * self.translation * unit)),
-            focal_sigma=priors.focal_sigma.hypot(torch.tensor(self.focal)),
-        )
-
 
 TABLE = (
     Noise(),

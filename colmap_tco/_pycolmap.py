@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import tempfile
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -124,6 +124,21 @@ def _cameras_size(model: Model) -> int:
 def is_spherical(camera: Camera) -> bool:
     """Whether the camera covers directions that no single pinhole can (its focal length does not exist)."""
     return str(camera.model.name) in SPHERICAL
+
+
+def camera(model: str, size: tuple[int, int], params: Sequence[float]) -> Camera:
+    """A camera of a model of COLMAP, such as THIN_PRISM_FISHEYE, of this (width, height) in pixels.
+
+    Raises:
+        InputError: no such model, or not its number of parameters.
+    """
+    try:
+        found = load().Camera(model=model, width=size[0], height=size[1], params=list(params))
+    except (ValueError, RuntimeError, TypeError) as error:
+        raise InputError(f"{model} is no camera model of this pycolmap: {error}") from error
+    if not found.verify_params():
+        raise InputError(f"camera model {model} does not take {len(params)} parameters")
+    return found
 
 
 def camera_size(camera: Camera) -> tuple[int, int]:
@@ -366,3 +381,17 @@ def run_mapper(inputs: tuple[Path, Path], output: Path, use_global: bool, thread
     run = pycolmap.global_mapping if use_global else pycolmap.incremental_mapping
     models = run(str(inputs[0]), str(inputs[1]), str(output), options=options)
     return sum(len(model.points3D) > 0 for model in models.values())
+
+
+def triangulate_points(model: Model, inputs: tuple[Path, Path], output: Path, threads: int) -> int:
+    """Write to ``output`` a model with the cameras of ``model`` and points, and return their number.
+
+    ``inputs`` are a database with matches, whose images, cameras and ids are those of the model, and the
+    image folder.
+    """
+    options = load().IncrementalPipelineOptions()
+    options.num_threads = threads
+    paths = [str(path) for path in (*inputs, output)]
+    found = load().triangulate_points(model, *paths, options=options)
+    found.write(paths[-1])
+    return len(found.points3D)

@@ -101,4 +101,10 @@ COMMANDS: dict[str, Command] = {
         "colmap_tco.mesh:mesh",
         (DENSE,),
     ),
+    "bench": Command(
+        "run rows of the paper's tables over ETH3D, DTU, 7-Scenes, NRGBD or ScanNet",
+        "colmap_tco.bench.command:BenchConfig",
+        "colmap_tco.bench.command:bench",
+        (),
+    ),
 }

@@ -52,6 +52,9 @@ COMPATIBILITY = frozenset({"photometric", "geometric", "warped", "consistency"})
 OWN = COMPATIBILITY | {"smoothness", "sparse", "depth", "cameras", "loss", "hidden", "held_out"}
 """Names that the history has already."""
 
+HELD = {"rotation": penalties.rotation, "translation": penalties.translation, "focal": penalties.focal}
+"""Terms that hold the cameras that a network predicts."""
+
 
 class Terms:
     """Terms of the views of one chunk, with what is known of them.
@@ -73,6 +76,9 @@ class Terms:
         self.depth_sigma, self.extra = priors.depth_sigma, tuple(extra)
         if len({term.name for term in extra}) < len(extra):
             raise ValueError(f"extra terms of one name: {', '.join(term.name for term in extra)}")
+        self.held = priors.held
+        if self.held is not None and self.given is not None:
+            raise ValueError("cameras are given, so that there are none of the network's own to be held")
         if config.depth_weight > 0 and priors.depth is None:
             raise ValueError("depth_weight is set and there is no dense depth among the priors")
         if self.given is None:
@@ -110,6 +116,8 @@ class Terms:
             "cameras": cameras if movable else 0.0,
             **{term.name: term.weight for term in self.extra},
         }
+        if self.held is not None:
+            every |= {name: getattr(self.held, name) for name in HELD}
         return {name: weight for name, weight in every.items() if weight > 0}
 
     def of_source(
@@ -137,6 +145,7 @@ class Terms:
             value = term.penalty(source, depth, cameras) if term.name in weights else None
             if value is not None:
                 terms[term.name] = value
+        terms |= self._held(prediction.cameras, weights)
         if not targets:
             return terms
         try:
@@ -159,6 +168,15 @@ class Terms:
         if self.depth_sigma is not None:
             return {"depth": penalties.depth_uncertain(*given, self.depth_sigma[chosen])}
         return {"depth": penalties.depth(*given)}
+
+    def _held(self, ours: Cameras, weights: Mapping[str, float]) -> dict[str, Tensor]:
+        """Penalties on the network's own cameras (arXiv 2604.03878, section 3.2.2)."""
+        if self.held is None:
+            return {}
+        theirs = self.held.cameras
+        pairs = {"focal": (ours.K, theirs.K)}
+        pairs["rotation"] = pairs["translation"] = (ours.world_from_cam, theirs.world_from_cam)
+        return {name: HELD[name](*pairs[name]) for name in HELD if name in weights}
 
     def _compatibility(
         self, source: int, targets: list[int], prediction: Prediction, context: Prediction,

@@ -115,6 +115,23 @@ class SparseDepth(_Movable):
 
 
 @dataclass(frozen=True)
+class HeldCameras(_Movable):
+    """Cameras that a network's own are held to by the paper's penalties; a weight of 0 leaves a part free.
+
+    Attributes:
+        cameras: what is known, in any world and scale.
+        rotation: weight of the mean angle between rotations relative to the first view, radians.
+        translation: weight of the mean L1 of centres relative to the first view, normalised by distance.
+        focal: weight of the mean L1 of focal lengths, pixels.
+    """
+
+    cameras: Cameras
+    rotation: float = 1.0
+    translation: float = 2.0
+    focal: float = 0.01
+
+
+@dataclass(frozen=True)
 class Priors(_Movable):
     """What is known about the views beside their pixels; None where it is not known.
 
@@ -128,6 +145,8 @@ class Priors(_Movable):
         focal_sigma: (V,) standard deviation of the relative focal length.
         depth_sigma: (V, H, W) standard deviation of the relative error of the dense depth, which then is in
             the unit of the cameras; None: not known, and the depth is of any scale and shift.
+        held: for networks that predict their cameras and are to keep predicting them, without ``cameras``:
+            what these are held to.
     """
 
     cameras: Cameras | None = None
@@ -138,6 +157,7 @@ class Priors(_Movable):
     centre_sigma: Tensor | None = None
     focal_sigma: Tensor | None = None
     depth_sigma: Tensor | None = None
+    held: HeldCameras | None = None
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,10 @@ START_UP = (
     "export/command",
     "export/dense",
     "mesh",
+    "bench/command",
+    "bench/rows",
+    "bench/noise",
+    "bench/schedules",
     "show",
     "viewer",
 )

@@ -18,7 +18,7 @@ from tco.options import PolishConfig, TCOConfig
 from tco.penalties import in_first_view, rotation_angle
 from tco.terms import ExtraTerm, Terms, means
 from tco.toy import Toy, Wall, wall
-from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
+from tco.types import Cameras, HeldCameras, Prediction, Priors, SparseDepth, Views
 
 
 @pytest.fixture(scope="module")
@@ -206,3 +206,32 @@ def test_means_are_over_the_parts_that_have_a_term() -> None:
     a, b, c = (torch.tensor(x) for x in (1.0, 3.0, 5.0))
     assert means([{"x": a}, {"x": b, "y": c}]) == {"x": torch.tensor(2.0), "y": c}
     assert means([]) == {}
+
+
+def test_a_networks_own_cameras_are_held_to_what_is_known(scene: Wall) -> None:
+    """The penalties alone bring rotations and centres to the known cameras, in whatever world these are."""
+    network = Moving(scene, degrees=4.0)
+    elsewhere = rigid(so3_exp(torch.tensor([0.4, -1.0, 0.3])), torch.tensor([3.0, -2.0, 5.0]))
+    known = Cameras(elsewhere @ network.true.world_from_cam, network.true.K)
+    held = Priors(held=HeldCameras(known, rotation=1.0, translation=2.0, focal=0.0))
+    config = TCOConfig(
+        steps=60, rate=0.01, lora_targets=("twist",), lora_rank=6, photometric_weight=0.0, sparse_weight=0.0,
+        consistency_weight=0.0, camera_rate=0.0,
+    )  # fmt: skip
+
+    def turn(outcome_poses: Tensor) -> float:
+        ours, theirs = in_first_view(outcome_poses), in_first_view(network.true.world_from_cam)
+        return math.degrees(float(rotation_angle(ours[:, :3, :3], theirs[:, :3, :3]).mean()))
+
+    before = optimize(network, scene.views, Priors(), replace(config, steps=0))
+    after = optimize(network, scene.views, held, config)
+    assert turn(after.cameras.world_from_cam) < 0.25 * turn(before.cameras.world_from_cam)
+    assert set(after.history[0]) == {"rotation", "translation", "loss"}
+    assert after.history[-1]["loss"] < 0.3 * after.history[0]["loss"]
+
+
+def test_cameras_cannot_be_given_and_held(scene: Wall) -> None:
+    cameras = scene.priors.cameras
+    assert cameras is not None
+    with pytest.raises(ValueError, match="none of the network's own"):
+        Terms(scene.views, replace(scene.priors, held=HeldCameras(cameras)), TCOConfig())

@@ -1,0 +1,301 @@
+"""``colmap-tco bench``: rows of the paper's tables over a dataset, beside the published figures."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+from colmap_tco.backbones import NetworkConfig, Selected, load, select, suited
+from colmap_tco.bench.rows import MEANING, Row, parse_rows
+from colmap_tco.bench.schedules import published as published_schedule
+from colmap_tco.errors import InputError, PartlyDoneError
+from colmap_tco.progress import Progress
+from tco.config import knob
+from tco.options import TCOConfig
+
+if TYPE_CHECKING:
+    from colmap_tco.bench.store import Result
+    from colmap_tco.datasets import Choice, Dataset
+    from tco.backbones.base import Backbone
+
+log = logging.getLogger(__name__)
+
+TAKE_CAMERAS = ("sweep",)
+"""Kinds of networks whose cameras are input, for which TCO's settings were not made."""
+
+DATASETS = ("eth3d", "dtu", "7scenes", "nrgbd", "scannet")
+
+
+@dataclass(frozen=True)
+class BenchConfig:
+    """What is measured on what."""
+
+    dataset: str = knob("", f"the dataset: {', '.join(DATASETS)}. Points are measured, for scannet poses")
+    root: Path | None = knob(None, "its folder, in the layout in which it is published, see docs/bench.md")
+    setting: str = knob(
+        "",
+        "which frames: sparse or dense for 7scenes and nrgbd, stride1, stride4 or stride16 for scannet; "
+        "empty: the first of these",
+    )
+    scenes: tuple[str, ...] = knob((), "scenes, such as courtyard or chess/seq-03; empty: all")
+    rows: tuple[str, ...] = knob(
+        ("tco",), "rows of the table. " + "; ".join(f"{row}: {told}" for row, told in MEANING.items())
+    )
+    priors: tuple[str, ...] = knob(
+        (), "what is given: pose, intrinsics; for scannet, depth. Empty: all that the table allows"
+    )
+    output: Path = knob(Path("bench"), "folder of the results; finished scenes in it are kept", alias="-o")
+    image_width: int = knob(
+        0, "width of the pictures that the network sees, pixels; 0: 518, as published, and 256 for sweep"
+    )
+    published_settings: bool = knob(
+        True,
+        "steps, rate and weights of TCO's scripts for the dataset where they were left alone, on its "
+        "schedule; off: what densify would do, as always for networks that take cameras as input",
+    )
+    as_published: bool = knob(
+        True,
+        "7scenes: focal length and poses as in the published evaluations, which its calibration contradicts; "
+        "off: as calibrated",
+    )
+    seed: int = knob(0, "of the noise and of the optimisation")
+    overwrite: bool = knob(False, "replace results that were made with other settings")
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    tco: TCOConfig = field(default_factory=TCOConfig)
+
+
+@dataclass(frozen=True)
+class Benched:
+    """What was measured.
+
+    Attributes:
+        table: table.md.
+        text: its content.
+    """
+
+    table: Path
+    text: str
+
+    def summary(self) -> str:
+        """The table and where it is."""
+        return f"{self.text}\n{self.table}, and scenes.csv and table.csv beside it"
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What all rows and scenes of a run have in common."""
+
+    config: BenchConfig
+    dataset: Dataset
+    setting: str
+    choice: Choice
+    scenes: tuple[str, ...]
+    chosen: Selected
+    folder: Path
+
+
+def bench(config: BenchConfig, progress: Progress) -> Benched:
+    """Run the rows over the scenes; finished ones are kept from before.
+
+    A scene that cannot be reconstructed or compared gets no figures, and the others go on.
+
+    Raises:
+        InputError: a dataset, setting, scene, row or prior that does not exist or does not go together, a
+            folder that is not in its layout, or results of other settings.
+        MissingError: no such device, or weights that are missing.
+        PartlyDoneError: some scenes have no figures; the tables were written.
+    """
+    from colmap_tco.bench.figures import COLUMNS
+    from colmap_tco.bench.numbers import published
+    from colmap_tco.bench.store import write_tables
+
+    run = _open(config)
+    rows = parse_rows(config.rows, _priors(config))
+    _check_priors(config.dataset, rows)
+    results = _results(run, rows, progress)
+    columns = COLUMNS[config.dataset]
+    known = published(config.dataset, run.setting)
+    table = write_tables(run.folder, results, columns, _about(run, rows), known)
+    failed = [result for row in results.values() for result in row if result.failed]
+    if failed:
+        told = "; ".join(f"{r.row}, {r.scene}: {r.failed}" for r in failed[:3])
+        raise PartlyDoneError(f"{len(failed)} scenes without figures ({told}); the others are in {table}")
+    return Benched(table, table.read_text("utf-8"))
+
+
+def _open(config: BenchConfig) -> _Run:
+    from colmap_tco.datasets import choice, open_dataset
+
+    if config.dataset not in DATASETS:
+        raise InputError(f"--dataset '{config.dataset}': there are {', '.join(DATASETS)}")
+    if config.root is None:
+        raise InputError(
+            f"--root names no folder: it is where {config.dataset} was unpacked, see docs/bench.md"
+        )
+    setting, frames = choice(config.dataset, config.setting)
+    dataset = open_dataset(config.dataset, config.root, config.as_published)
+    there = dataset.scenes()
+    lacking = [scene for scene in config.scenes if scene not in there]
+    if lacking:
+        raise InputError(f"--scenes {lacking[0]}: {config.root} has {', '.join(there)}")
+    chosen = select(config.network)
+    folder = config.output / f"{config.dataset}-{setting}-{chosen.network.name}"
+    return _Run(config, dataset, setting, frames, config.scenes or tuple(there), chosen, folder)
+
+
+def _priors(config: BenchConfig) -> tuple[str, ...]:
+    """What is given where rows do not say: all that the table allows, if nothing was named."""
+    return config.priors or (("depth",) if config.dataset == "scannet" else ("pose", "intrinsics"))
+
+
+def _check_priors(dataset: str, rows: Sequence[Row]) -> None:
+    """What a table measures cannot be given."""
+    for row in rows:
+        if dataset == "scannet" and ({"pose", "intrinsics"} & set(row.priors) or row.cameras):
+            raise InputError(
+                f"--rows {row.name}: for scannet poses are measured, so that they cannot be given; rows with "
+                "--priors depth can be run"
+            )
+        if dataset != "scannet" and "depth" in row.priors:
+            raise InputError(
+                f"--rows {row.name}: the depth of {dataset} is the truth that points are compared with, so "
+                "that it cannot be given; use --priors pose,intrinsics"
+            )
+
+
+def _results(run: _Run, rows: Sequence[Row], progress: Progress) -> dict[str, list[Result]]:
+    """Row → results of its scenes; a scene is prepared once for all its rows."""
+    from colmap_tco.bench.store import read_result, write_result
+
+    found: dict[str, dict[str, Result]] = {row.name: {} for row in rows}
+    todo: list[tuple[str, list[Row]]] = []
+    for scene in run.scenes:
+        for row in rows:
+            kept = read_result(run.folder, row.name, scene, _settings(run, row, scene), run.config.overwrite)
+            if kept is not None:
+                found[row.name][scene] = kept
+        todo.append((scene, [row for row in rows if scene not in found[row.name]]))
+    open_rows = sum(len(left) for _, left in todo)
+    kept_rows = len(rows) * len(run.scenes) - open_rows
+    if kept_rows:
+        log.info("%s: %d results are kept, %d are to be made", run.folder, kept_rows, open_rows)
+    progress.stage("rows and scenes", open_rows)
+    if open_rows:
+        network = load(run.chosen)
+        _check_rows(network, rows)
+        for scene, left in todo:
+            for result in _scene(run, network, scene, left):
+                write_result(run.folder, _settings(run, _named(rows, result.row), scene), result)
+                found[result.row][scene] = result
+                progress.advance()
+    return {name: [by_scene[scene] for scene in run.scenes] for name, by_scene in found.items()}
+
+
+def _check_rows(network: Backbone, rows: Sequence[Row]) -> None:
+    from colmap_tco.bench.methods import check_row
+
+    for row in rows:
+        check_row(network, row)
+
+
+def _named(rows: Sequence[Row], name: str) -> Row:
+    return next(row for row in rows if row.name == name)
+
+
+def _scene(run: _Run, network: Backbone, scene: str, rows: Sequence[Row]) -> list[Result]:
+    """Results of some rows on one scene."""
+    from colmap_tco.bench.prepare import Prepared, resized, triangulated
+    from colmap_tco.bench.store import Result
+
+    if not rows:
+        return []
+    width = run.config.image_width or (run.chosen.network.image_size if network.uses_cameras else 518)
+    frames: list[int] = []
+    with TemporaryDirectory(prefix="colmap-tco-bench-") as folder:
+        try:
+            frames = run.choice.frames(run.dataset.count(scene))
+            read = run.dataset.read(scene, frames)
+            prepared: Prepared = (
+                triangulated(read, width, network.stride, Path(folder), run.config.seed)
+                if network.uses_cameras
+                else resized(read, width, network.stride)
+            )
+        except InputError as error:
+            log.warning("%s: %s", scene, error)
+            return [Result(row.name, scene, {}, 0.0, len(frames), str(error)) for row in rows]
+    return [_row(run, network, scene, prepared, row) for row in rows]
+
+
+def _row(run: _Run, network: Backbone, scene: str, prepared: Any, row: Row) -> Result:
+    """One row on one scene."""
+    from colmap_tco.bench.figures import UNITS, point_figures, pose_figures
+    from colmap_tco.bench.methods import reconstruct
+    from colmap_tco.bench.store import Result
+
+    config, views = _tco(run), len(prepared.views)
+    start = time.perf_counter()
+    made = reconstruct(network, prepared, row, config, run.chosen.device, run.config.seed)
+    seconds = time.perf_counter() - start
+    try:
+        if run.config.dataset == "scannet":
+            figures = pose_figures(made.world_from_cam, prepared.world_from_cam)
+        else:
+            per_metre = UNITS.get(run.config.dataset, 1.0)
+            figures = point_figures(made.points, prepared.points, prepared.known, per_metre)
+    except InputError as error:
+        log.warning("%s, %s: %s", row.name, scene, error)
+        return Result(row.name, scene, {}, seconds, views, str(error))
+    told = ", ".join(f"{name} {value:.4f}" for name, value in figures.items())
+    log.info("%s, %s: %d views, %.1f s: %s", row.name, scene, views, seconds, told)
+    return Result(row.name, scene, figures, seconds, views)
+
+
+def _tco(run: _Run) -> TCOConfig:
+    """The settings of the optimisation before rows change them."""
+    own = suited(run.config.tco, run.chosen.network)
+    if not run.config.published_settings or run.chosen.network.kind in TAKE_CAMERAS:
+        return own
+    return published_schedule(run.config.dataset, run.config.tco)
+
+
+def _settings(run: _Run, row: Row, scene: str) -> Mapping[str, Any]:
+    """All that decides a result, as JSON can hold it."""
+    c, weights = run.config, run.chosen.weights
+    return {
+        "dataset": c.dataset,
+        "setting": run.setting,
+        "as_published": c.as_published,
+        "scene": scene,
+        "backbone": run.chosen.network.name,
+        "weights": f"{weights.name}, {weights.stat().st_size} bytes",
+        "image_width": c.image_width,
+        "seed": c.seed,
+        "row": row.name,
+        "priors": list(row.priors),
+        "tco": asdict(row.config(_tco(run))),
+    }
+
+
+def _about(run: _Run, rows: Sequence[Row]) -> list[str]:
+    """What the table's head says."""
+    config, unit = _tco(run), "millimetres" if run.config.dataset == "dtu" else "metres"
+    what = "Poses, in metres and degrees" if run.config.dataset == "scannet" else f"Points, in {unit}"
+    told = "; ".join(f"{row.name}: {MEANING.get(row.name, MEANING.get(_kind(row.name), ''))}" for row in rows)
+    return [
+        f"# {run.config.dataset}, {run.setting}, {run.chosen.network.name}",
+        f"{what}; means over scenes. Weights: {run.chosen.weights.name}. Priors: "
+        f"{', '.join(_priors(run.config))}. {config.steps} steps at a rate of {config.rate:g} where a row "
+        f"does not say otherwise, seed {run.config.seed}.",
+        f"Rows: {told}.",
+    ]
+
+
+def _kind(name: str) -> str:
+    """``rank=N`` of ``rank=16``."""
+    kind = name.partition("=")[0]
+    return next((key for key in MEANING if key.partition("=")[0] == kind), name)
