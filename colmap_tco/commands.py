@@ -101,4 +101,14 @@ COMMANDS: dict[str, Command] = {
         "colmap_tco.mesh:mesh",
         (DENSE,),
     ),
+    "evaluate": Command(
+        "compare a result with true depths, a true cloud or true cameras",
+        "colmap_tco.evaluation.command:EvaluateConfig",
+        "colmap_tco.evaluation.command:evaluate",
+        (
+            Argument(
+                "result", "workspace with dense-tco/, dense workspace of COLMAP, COLMAP model, or a cloud"
+            ),
+        ),
+    ),
 }

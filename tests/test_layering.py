@@ -43,6 +43,14 @@ START_UP = (
     "mesh",
     "show",
     "viewer",
+    "evaluation/command",
+    "evaluation/sections",
+    "evaluation/sources",
+    "evaluation/maps",
+    "evaluation/align",
+    "evaluation/points",
+    "evaluation/eth3d",
+    "evaluation/trajectory",
 )
 """Modules of ``colmap_tco`` that the command line imports for their settings: nothing in LAZY at the top."""
 
