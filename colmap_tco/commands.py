@@ -65,6 +65,12 @@ COMMANDS: dict[str, Command] = {
         "colmap_tco.densify:DensifyConfig",
         "colmap_tco.densify:densify",
     ),
+    "poses": Command(
+        "find poses of images from their depth maps (RGB-D, LiDAR): a COLMAP model and a trajectory",
+        "colmap_tco.poses:PosesConfig",
+        "colmap_tco.poses:poses",
+        (Argument("images", "folder of the images"),),
+    ),
     "report": Command(
         "make the page of a finished result anew and open it in the browser",
         "colmap_tco.show:ReportConfig",

@@ -26,7 +26,7 @@ COLUMNS = {"source_turn": slice(0, 3), "source_shift": slice(3, 6), "target_turn
            "target_shift": slice(9, 12), "focal": slice(12, 13), "scale": slice(13, 14)}  # fmt: skip
 """What the 14 columns of a Jacobian belong to."""
 
-_STEEPEST = float(__import__('os').environ.get('STEEP','0.2'))
+_STEEPEST = 0.2
 """Relative difference of depth between neighbouring pixels above which they lie on different surfaces."""
 
 
@@ -97,7 +97,8 @@ class Pair:
         in_source = by_point @ source_from_target[:3, :3].T
         in_world = by_point @ pose[1, :3, :3].T
         offset = pose[0, :3, 3] - pose[1, :3, 3]
-        pixel = pixel_grid(*self.depth.shape, z)[keep] - K[1, :2, 2]
+        h, w = self.depth.shape
+        pixel = pixel_grid(h, w, z)[keep] - K[1, :2, 2]
         zoom = -(in_source[:, :2] * x[:, :2]).sum(-1) - (slope * pixel).sum(-1)
         columns = [
             torch.linalg.cross(x, in_source), in_world, -torch.linalg.cross(X, by_point), -in_world,

@@ -12,17 +12,21 @@ class PoseConfig:
     """Rough poses, moved until the depths of the views agree (``tco/poses.py``)."""
 
     sizes: tuple[int, ...] = knob(
-        (80, 160, 320),
+        (48, 80, 160),
         "longer sides of the images, from coarse to fine, pixels; the first decides how wrong poses may be, "
         "the last how exact they get and how long it takes",
     )
-    iterations: tuple[int, ...] = knob((12, 6, 4), "most Gauss–Newton steps at each of the sizes")
-    neighbours: int = knob(8, "views that each view is rendered into; more tie long sequences better")
+    iterations: tuple[int, ...] = knob((14, 6, 5), "most Gauss–Newton steps at each of the sizes")
+    neighbours: int = knob(6, "views that each view is rendered into; more tie long sequences better")
     least_overlap: float = knob(
         0.2, "share of a view's depths that another must see, by the rough poses, to be compared with it"
     )
     geometric: float = knob(1.0, "weight of the depths of the rendered surfels; 0: colours alone")
-    photometric: float = knob(0.0, "weight of the colours of the rendered surfels; 0: depths alone")
+    photometric: float = knob(
+        1.0,
+        "weight of the colours of the rendered surfels; 0: depths alone, for lights that change or depths "
+        "without pictures of any use",
+    )
     rough_rotation: float = knob(3.0, "standard deviation of the rough rotations, degrees")
     rough_centre: float = knob(
         0.05, "standard deviation of the rough centres, as a share of their mean distance from their middle"
@@ -31,7 +35,7 @@ class PoseConfig:
         0.0, "standard deviation of the relative focal length, one factor for all views; 0 keeps them"
     )
     independent: float = knob(
-        60.0,
+        1000.0,
         "independent comparisons in a view: errors of neighbouring pixels are alike, so that all pixels "
         "together weigh no more than this many against the rough poses. Raise it where these are worse than "
         "their standard deviations say",
@@ -41,7 +45,7 @@ class PoseConfig:
     )
     occlusion_tolerance: float = knob(
         0.02, "a rendered surface further behind a measured one by this share of its depth does not count; "
-        "three standard deviations of what the views disagree by at the moment, where that is more",
+        "ten standard deviations of what the views disagree by at the moment, where that is more",
     )  # fmt: skip
 
     def __post_init__(self) -> None:

@@ -16,7 +16,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -28,7 +28,7 @@ from tco.linearise import COLUMNS, Linear, Pair
 from tco.objective import ObjectiveConfig
 from tco.pose_options import PoseConfig
 from tco.render import render
-from tco.surfels import from_depth
+from tco.surfels import from_depth, supported
 from tco.types import Cameras, Priors, Views
 
 logger = logging.getLogger(__name__)
@@ -40,7 +40,9 @@ _TRUSTED = 100.0
 _SETTLED = 0.02
 """Largest change in standard deviations of the rough poses below which a size is done."""
 _LONGEST = 3.0
-"""Longest step of a parameter in standard deviations: beyond, the derivatives say little."""
+"""Longest turn or shift of a step in standard deviations: beyond, the derivatives say little."""
+_FIRST_NOISE = 0.1
+"""Relative depth that views are taken to disagree by before anything is known."""
 _FREE_SCALE = 0.3
 """Standard deviation of the logarithm of a scale that is not known but roughly found."""
 _LOOSE = 0.3
@@ -80,6 +82,13 @@ class Poses:
     focal: float
     moved: tuple[bool, ...]
     history: list[dict[str, float]] = field(default_factory=list)
+
+
+def surfel_share(level: Level) -> float:
+    """Share of the measured pixels whose four neighbours are measured, too: only these become surfels."""
+    known = level.views.valid & (level.depth > 0)
+    count = int(known.sum())
+    return float(torch.stack([supported(mask) for mask in known]).sum()) / count if count else 0.0
 
 
 class NothingSharedError(ValueError):
@@ -144,13 +153,11 @@ def refine(
     kept = torch.tensor(moved)
     base = state.scaled(priors.cameras)
     poses = beside(cameras.world_from_cam, base.world_from_cam, kept)
-    return Poses(
-        Cameras(poses, cameras.K), state.scale, math.exp(float(state.zoom)), moved, history
-    )
+    return Poses(Cameras(poses, cameras.K), state.scale, math.exp(float(state.zoom)), moved, history)
 
 
 def beside(poses: Tensor, rough: Tensor, kept: Tensor) -> Tensor:
-    """Poses (V, 4, 4) moved rigidly, as near to rough ones as those ``kept`` (V,) can lie; others are rough."""
+    """Poses (V, 4, 4) moved rigidly, so that those ``kept`` (V,) lie nearest to rough ones; others: rough."""
     if int(kept.sum()) < 2:
         return poses
     near = align_cameras(poses[kept], rough[kept])
@@ -160,12 +167,17 @@ def beside(poses: Tensor, rough: Tensor, kept: Tensor) -> Tensor:
 
 
 class _State:
-    """The unknowns, each in standard deviations but for the two logarithms."""
+    """The unknowns, each in standard deviations but for the logarithm of the scale.
+
+    Attributes:
+        noise: relative depth by which the views disagreed in the last step.
+    """
 
     def __init__(self, priors: Priors, free_scale: bool) -> None:
         self.priors, self.free_scale = priors, free_scale
         self.corrections = CameraCorrections(priors)
         self.log_scale = torch.zeros((), dtype=torch.float64)
+        self.noise = _FIRST_NOISE
 
     @property
     def scale(self) -> float:
@@ -194,7 +206,8 @@ class _State:
 
     def columns(self, source: int, target: int, jacobian: Tensor) -> tuple[Tensor, Tensor]:
         """Derivatives (P, 14) by the unknowns themselves, and where (14,) these are in the whole vector."""
-        v, (rotation, centre, focal) = len(self.priors.rotation_sigma), self.corrections.sigmas  # type: ignore[arg-type]
+        rotation, centre, focal = self.corrections.sigmas
+        v = len(rotation)
         J = jacobian.clone()
         units = {"source_turn": rotation[source], "target_turn": rotation[target],
                  "source_shift": centre[source] * self.scale, "target_shift": centre[target] * self.scale,
@@ -222,23 +235,27 @@ class _State:
         each = change[:-2].reshape(-1, 2, 3)
         length = each.norm(dim=-1).amax(-1)
         each = each * (_LONGEST / length.clamp_min(_LONGEST))[:, None, None]
-        c.turn += each[:, 0]
-        c.shift += each[:, 1]
-        c.zoom += change[-2].clamp(-_LONGEST, _LONGEST)
+        c.turn.add_(each[:, 0])
+        c.shift.add_(each[:, 1])
+        c.zoom.add_(change[-2].clamp(-_LONGEST, _LONGEST))
         self.log_scale += change[-1].clamp(-_LONGEST * _FREE_SCALE, _LONGEST * _FREE_SCALE)
         return float(length.max())
 
 
+_NOISE_OF_BRIGHTNESS = 0.01
+"""Difference of brightness that is never taken for better."""
 _FIXED = 1e12
 """Weight of an unknown that is none."""
 
 
 @torch.no_grad()
-def _step(level: Level, state: _State, pairs: Sequence[Sequence[int]], config: PoseConfig) -> dict[str, float]:
-    """One Gauss–Newton step on all pairs at once, with Cauchy weights by the present disagreement."""
+def _step(
+    level: Level, state: _State, pairs: Sequence[Sequence[int]], config: PoseConfig
+) -> dict[str, float]:
+    """One Gauss–Newton step on all pairs at once, with Huber weights by the present disagreement."""
     cameras = state.cameras(level)
     parts: dict[str, list[tuple[int, int, Linear]]] = {"geometric": [], "photometric": []}
-    tolerance = max(config.occlusion_tolerance, float(__import__('os').environ.get('TOLF','10')) * state_noise(state))
+    tolerance = max(config.occlusion_tolerance, 10 * state.noise)
     for source, targets in enumerate(pairs):
         for target, pair in zip(targets, _rendered(level, cameras, source, targets), strict=True):
             for name, linear in _residuals(level, pair, target, config, tolerance).items():
@@ -258,12 +275,8 @@ def _step(level: Level, state: _State, pairs: Sequence[Sequence[int]], config: P
     return {**figures, "step": longest}
 
 
-def state_noise(state: _State) -> float:
-    return getattr(state, "noise", 0.1)
-
-
 def _floor(name: str, config: PoseConfig) -> float:
-    return config.noise_floor if name == "geometric" else 0.01
+    return config.noise_floor if name == "geometric" else _NOISE_OF_BRIGHTNESS
 
 
 def _spread(found: Sequence[Linear], floor: float) -> float:
@@ -288,10 +301,9 @@ def _accumulate(
     whole = sum(float(linear.weight.sum()) for _, _, linear in found)
     for source, target, linear in found:
         J, where = state.columns(source, target, linear.jacobian)
-        import os
-        kk=os.environ.get('KERNEL','huber')
-        e=linear.residual.abs()/(2*spread)
-        robust = linear.weight * (1/(1+e**2) if kk=='cauchy' else 1/e.clamp_min(1) if kk=='huber' else torch.ones_like(e))
+        # A kernel that redescends would drop the edges: while poses are wrong, these are far off, and most
+        # of what tells how a view must move along its surfaces.
+        robust = linear.weight / (linear.residual.abs() / (2 * spread)).clamp_min(1.0)
         W = robust * worth / max(whole, 1e-9) / spread**2
         H[where.unsqueeze(1), where.unsqueeze(0)] += J.T @ (W.unsqueeze(1) * J)
         g[where] += J.T @ (W * linear.residual)
