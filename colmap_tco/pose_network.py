@@ -1,4 +1,4 @@
-"""Poses that a network finds when TCO adapts it to the measured depths (arXiv 2604.03878, its second task)."""
+"""Poses that a network finds when TCO adapts it to measured depths (arXiv 2604.03878, the second task)."""
 
 from __future__ import annotations
 

@@ -157,7 +157,7 @@ def refine(
 
 
 def beside(poses: Tensor, rough: Tensor, kept: Tensor) -> Tensor:
-    """Poses (V, 4, 4) moved rigidly, so that those ``kept`` (V,) lie nearest to rough ones; others: rough."""
+    """Poses (V, 4, 4) moved rigidly, those ``kept`` (V,) nearest to rough ones; others: rough."""
     if int(kept.sum()) < 2:
         return poses
     near = align_cameras(poses[kept], rough[kept])
