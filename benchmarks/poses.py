@@ -33,7 +33,7 @@ ROTATION, TRANSLATION = 3.0, 0.05
 
 
 def perturbed(world: np.ndarray, seed: int) -> np.ndarray:
-    """Poses (V, 4, 4) with normal errors: degrees about random axes, shares of the mean distance of centres."""
+    """Poses (V, 4, 4) with normal errors: angles about random axes, shares of the centres' distance."""
     from scipy.spatial.transform import Rotation
 
     rng, out, centre = np.random.default_rng(seed), world.copy(), world[:, :3, 3]
@@ -60,7 +60,7 @@ def write_tum(path: Path, world: np.ndarray) -> None:
 
 def measured(
     name: str, seed: int | None, config: PoseConfig
-) -> tuple[np.ndarray, TrajectoryFigures, TrajectoryFigures, float]:
+) -> tuple[float, TrajectoryFigures, TrajectoryFigures, float]:
     """Mean distance of the centres, figures before and after, and seconds; no seed: COLMAP's own poses."""
     root = SHARED / name
     known = json.loads((root / "gt" / "gt.json").read_text(encoding="utf-8"))
@@ -85,7 +85,12 @@ def measured(
         ours = read_tum(found.folder / "trajectory.txt").poses
     centre = truth[:, :3, 3]
     unit = np.linalg.norm(centre - centre.mean(0), axis=1).mean()
-    return unit, trajectory_figures(rough, truth), trajectory_figures(ours, truth), found.report["seconds"]
+    return (
+        float(unit),
+        trajectory_figures(rough, truth),
+        trajectory_figures(ours, truth),
+        found.report["seconds"],
+    )
 
 
 def row(name: str, seed: int | None, config: PoseConfig) -> str:

@@ -110,7 +110,7 @@ def surface_points(
     surfaces are.
 
     Returns:
-        Keypoints (N, 2) of each view in its undistorted image, the points (N,) that they are of, and ids (P,),
+        Keypoints (N, 2) of each view in its undistorted image, the points (N,) they are of, and ids (P,),
         positions (P, 3) and colours (P, 3) of the points.
     """
     canvas = found.depth.shape[1:]

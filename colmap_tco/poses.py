@@ -43,8 +43,8 @@ class PosesConfig:
 
     depths: Path | None = knob(
         None,
-        "folder of the depth maps, registered to the images and named like them: 16-bit PNG, .npy or COLMAP's "
-        ".bin, of any resolution; 0, NaN and 65535 are not measured",
+        "folder of the depth maps, registered to the images and named like them: 16-bit PNG, .npy or "
+        "COLMAP's .bin, of any resolution; 0, NaN and 65535 are not measured",
     )
     depth_unit: float = knob(
         0.001, "length of one count of 16-bit PNG files, metres; .npy and .bin are metres"
@@ -119,7 +119,7 @@ def poses(images: Path, config: PosesConfig, progress: Progress) -> Trajectory:
         "scale": scale * done.scale,
         "scale_origin": origin + (f", then times {done.scale:.5g}" if rough.free_scale else ""),
         "focal_factor": done.focal,
-        "disagreement": {"before": done.history[0], "after": done.history[-1]} if done.history else {"after": {}},
+        "disagreement": {"before": (done.history or [{}])[0], "after": (done.history or [{}])[-1]},
         "history": done.history,
         "settings": config,
         "versions": report.versions(),
@@ -239,7 +239,7 @@ def _refined(
 
 
 def _found(views: Sequence[View], frame: ChunkFrame, scale: float, done: Poses, finest: Level) -> Found:
-    """The result in the frame of the rough poses, in the unit of the depths, and the surfaces seen from it."""
+    """The result in the frame of the rough poses, in the unit of the depths, with the measured surfaces."""
     total = scale * done.scale
     R0, t0 = frame.cam_from_world[:, :3], frame.cam_from_world[:, 3]
     unit = frame.scale * scale

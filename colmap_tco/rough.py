@@ -93,7 +93,7 @@ def read_rough(folder: Path, names: Sequence[str], config: RoughConfig) -> Rough
     without = {name: "no rough pose" for name in sorted(here - {entry.name for entry in images})}
     if len(images) < 2:
         raise InputError(
-            f"--rough {path} has poses for {len(images)} of the {len(names)} images in {folder}, and it takes "
+            f"--rough {path} has poses for {len(images)} of the {len(names)} images in {folder}, it takes "
             "two; a model names its images relative to this folder"
         )
     if without:

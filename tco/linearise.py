@@ -1,7 +1,7 @@
 """How what one view shows of another changes with the cameras: residuals and their derivatives.
 
 The surfels of a source view are rendered into a target. Where the render has depth D at a target pixel, it
-shows the point X = D K⁻¹ (u, v, 1). Moving a camera moves that point by δX in the target's frame and its image
+shows the point X = D K⁻¹ (u, v, 1). Moving a camera moves that point by δX in the target's frame, its image
 by π = J δX, so that the rendered depth at the pixel becomes D + δX_z − ∇D · π, and a rendered colour
 C − ∇C · π (the derivative of an image that is carried along). With the pose of a view [R exp(ω), c + δ] and
 its focal lengths f exp(ζ), as in :mod:`tco.corrections`,

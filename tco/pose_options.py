@@ -21,7 +21,11 @@ class PoseConfig:
     least_overlap: float = knob(
         0.2, "share of a view's depths that another must see, by the rough poses, to be compared with it"
     )
-    geometric: float = knob(1.0, "weight of the depths of the rendered surfels; 0: colours alone")
+    geometric: float = knob(
+        0.1,
+        "weight of the depths of the rendered surfels; 0: colours alone. Raise it to 1 where the depths are "
+        "exact or pictures say little",
+    )
     photometric: float = knob(
         1.0,
         "weight of the colours of the rendered surfels; 0: depths alone, for lights that change or depths "
@@ -35,7 +39,7 @@ class PoseConfig:
         0.0, "standard deviation of the relative focal length, one factor for all views; 0 keeps them"
     )
     independent: float = knob(
-        1000.0,
+        100.0,
         "independent comparisons in a view: errors of neighbouring pixels are alike, so that all pixels "
         "together weigh no more than this many against the rough poses. Raise it where these are worse than "
         "their standard deviations say",

@@ -73,8 +73,8 @@ class Poses:
         scale: factor of the rough centres.
         focal: factor of the focal lengths.
         moved: V flags; False for a view that has no depth, or none that others see, and stays where it was.
-        history: of each step ``size``, ``geometric`` or ``photometric`` (robust standard deviation of what the
-            views disagree by), and ``step`` (largest change in standard deviations of the rough poses).
+        history: of each step ``size``, ``geometric`` or ``photometric`` (robust standard deviation of what
+            the views disagree by), and ``step`` (largest change in standard deviations of the rough poses).
     """
 
     cameras: Cameras
