@@ -3,9 +3,9 @@
     python -m benchmarks.poses [--sets kitchen office livingroom] [--seeds 0 1] [--output docs/poses-table.md]
 
 COLMAP's poses, in metres, are turned about a random axis by a normal angle (3°) and moved in a random
-direction by a normal length (5 % of the mean distance of the centres from their middle). They go into the
-command as a TUM trajectory with COLMAP's camera, beside the folder of the sensor's depth maps. ATE and RPE are
-root mean squares after Umeyama's alignment with scale, by evo, against COLMAP's poses. COLMAP, camera and depth
+direction by a normal length (5 % of the mean distance of the centres from their middle). They go into
+the command as a TUM trajectory with COLMAP's camera, with the sensor's depth maps. ATE and RPE are
+root mean squares after Umeyama's alignment with scale, by evo, against COLMAP's. COLMAP, camera and depth
 themselves agree to 0.5 to 2 %, so that errors of some millimetres cannot be told from the truth's: rows
 ``exact`` start from COLMAP's own poses and say where the depths would have them.
 """
