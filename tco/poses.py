@@ -238,7 +238,8 @@ class _State:
         c.turn.add_(each[:, 0])
         c.shift.add_(each[:, 1])
         c.zoom.add_(change[-2].clamp(-_LONGEST, _LONGEST))
-        self.log_scale += change[-1].clamp(-_LONGEST * _FREE_SCALE, _LONGEST * _FREE_SCALE)
+        if self.free_scale:
+            self.log_scale += change[-1].clamp(-_LONGEST * _FREE_SCALE, _LONGEST * _FREE_SCALE)
         return float(length.max())
 
 

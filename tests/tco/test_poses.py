@@ -162,7 +162,7 @@ def test_a_view_without_depth_stays_where_it_was(levels: list[Level]) -> None:
         level.depth[2] = 0
     done = refine(blind[:1], rough, PoseConfig(sizes=(48,), iterations=(3,), neighbours=4))
     assert done.moved == (True, True, False, True, True)
-    torch.testing.assert_close(done.cameras.world_from_cam[2], rough[2], atol=1e-12, rtol=0)
+    torch.testing.assert_close(done.cameras.world_from_cam[2], rough[2], atol=1e-10, rtol=0)
     assert errors(done.cameras.world_from_cam[[0, 1, 3, 4]], arc()[[0, 1, 3, 4]])[0] < 3
 
 
