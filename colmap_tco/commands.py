@@ -65,6 +65,12 @@ COMMANDS: dict[str, Command] = {
         "colmap_tco.densify:DensifyConfig",
         "colmap_tco.densify:densify",
     ),
+    "poses": Command(
+        "find poses of images from their depth maps (RGB-D, LiDAR): a COLMAP model and a trajectory",
+        "colmap_tco.poses:PosesConfig",
+        "colmap_tco.poses:poses",
+        (Argument("images", "folder of the images"),),
+    ),
     "report": Command(
         "make the page of a finished result anew and open it in the browser",
         "colmap_tco.show:ReportConfig",
@@ -106,5 +112,15 @@ COMMANDS: dict[str, Command] = {
         "colmap_tco.bench.command:BenchConfig",
         "colmap_tco.bench.command:bench",
         (),
+    ),
+    "evaluate": Command(
+        "compare a result with true depths, a true cloud or true cameras",
+        "colmap_tco.evaluation.command:EvaluateConfig",
+        "colmap_tco.evaluation.command:evaluate",
+        (
+            Argument(
+                "result", "workspace with dense-tco/, dense workspace of COLMAP, COLMAP model, or a cloud"
+            ),
+        ),
     ),
 }

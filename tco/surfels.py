@@ -119,7 +119,7 @@ def from_depth(
     else:
         opacity = torch.ones_like(depth)
     surfels = Surfels(means, quats, radii.reshape(-1, 2), opacity.reshape(-1), image.flatten(1).T)
-    keep = _supported(depth > config.min_depth if valid is None else valid & (depth > config.min_depth))
+    keep = supported(depth > config.min_depth if valid is None else valid & (depth > config.min_depth))
     if bool(keep.all()):
         return surfels
     return _select(surfels, keep.reshape(-1))
@@ -160,7 +160,7 @@ def _frames(points: Tensor, config: SurfelConfig) -> tuple[Tensor, Tensor]:
     return torch.stack([t_u, t_v, normal], -1), radii.clamp_min(config.min_radius)
 
 
-def _supported(valid: Tensor) -> Tensor:
+def supported(valid: Tensor) -> Tensor:
     """Pixels (H, W) that are valid together with their four neighbours inside the map."""
     keep = valid.clone()
     keep[1:] &= valid[:-1]

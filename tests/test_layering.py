@@ -45,8 +45,21 @@ START_UP = (
     "bench/rows",
     "bench/noise",
     "bench/schedules",
+    "poses",
+    "rough",
+    "depth_views",
+    "pose_network",
+    "pose_outputs",
     "show",
     "viewer",
+    "evaluation/command",
+    "evaluation/sections",
+    "evaluation/sources",
+    "evaluation/maps",
+    "evaluation/align",
+    "evaluation/points",
+    "evaluation/eth3d",
+    "evaluation/trajectory",
 )
 """Modules of ``colmap_tco`` that the command line imports for their settings: nothing in LAZY at the top."""
 

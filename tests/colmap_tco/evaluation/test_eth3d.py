@@ -114,7 +114,7 @@ def cells(points: Floats, marks: NDArray[np.int_], voxel: float) -> float:
     return sum(shares) / len(shares) if shares else 0.0
 
 
-@pytest.mark.parametrize("tolerance", [0.05, 0.2, 0.6])
+@pytest.mark.parametrize("tolerance", [0.15, 0.3, 0.6])
 def test_random_scans_as_by_brute_force(tolerance: float) -> None:
     rng = np.random.default_rng(4)
     scans = [posed(rng.normal(size=(40, 3)) + [0, 0, 2], seed)[0] for seed in (1, 2)]
