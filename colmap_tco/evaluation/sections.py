@@ -67,12 +67,13 @@ def read_pixels(
     Raises:
         InputError: see :func:`colmap_tco.evaluation.maps.depth_pairs`.
     """
-    count = len(true_maps(outcome, folder))
+    files = true_maps(outcome, folder)
+    count = len(files)
     true_poses = {} if poses is None else matched(outcome, poses, config.match, config.max_time_difference)
     progress.stage("depth maps", count)
     each = math.ceil(config.clouds.max_points / count) if config.clouds.max_points else None
     pairs, seen, there, truth = {}, [], [], []
-    for pair in depth_pairs(outcome, folder, config.units.depth_unit, max(1, config.max_pixels // count)):
+    for pair in depth_pairs(outcome, files, config.units.depth_unit, max(1, config.max_pixels // count)):
         pairs[pair.name] = (pair.predicted * np.float32(config.units.metres_per_unit), pair.truth)
         if poses is None or pair.name in true_poses:
             mine, yours, every = _as_points(

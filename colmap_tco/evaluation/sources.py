@@ -109,7 +109,7 @@ def open_outcome(path: Path, model_path: Path | None = None) -> Outcome:
         cloud = dense.paths.ply if dense.paths.ply.is_file() else None
         figures = dense.paths.root / "evaluation.json" if ours else beside
         return Outcome(path, dense, cloud, cameras, figures)
-    if not model_path and not find_models(path):
+    if not model_path and not _models(path):
         raise InputError(
             f"{path}: no dense workspace (dense-tco/, or sparse/ and stereo/), no COLMAP model, and no cloud"
         )
@@ -123,11 +123,19 @@ def _original_model(paths: DensePaths) -> Path:
             noted = json.loads(paths.report.read_text(encoding="utf-8")).get("workspace", {}).get("model", "")
         except (ValueError, AttributeError) as error:
             raise InputError(f"{paths.report}: not a report of colmap-tco ({error})") from error
-        if noted and find_models(Path(noted)):
+        if noted and _models(Path(noted)):
             return Path(noted)
-    if paths.root.name == dense_paths(paths.root).root.name and find_models(paths.root.parent):
+    if paths.root.name == dense_paths(paths.root).root.name and _models(paths.root.parent):
         return paths.root.parent
     return paths.sparse
+
+
+def _models(folder: Path) -> list[Path]:
+    """Models in a folder, which may be the one that COLMAP's mapper wrote them into."""
+    if not folder.is_dir():
+        return []
+    inside = [sub for sub in sorted(folder.iterdir()) if sub.is_dir() and sub in find_models(sub)]
+    return find_models(folder) or inside
 
 
 def read_cameras(folder: Path) -> dict[str, Registered]:
@@ -136,7 +144,7 @@ def read_cameras(folder: Path) -> dict[str, Registered]:
     Raises:
         InputError: no model, or none that can be read and has poses.
     """
-    folders = find_models(folder.expanduser().absolute()) if folder.is_dir() else []
+    folders = _models(folder.expanduser().absolute())
     if not folders:
         raise InputError(f"{folder}: no COLMAP model, neither in it nor in its sparse/")
     models = [_pycolmap.registered(_pycolmap.read_model(one)) for one in folders]
@@ -176,7 +184,7 @@ def open_truth(path: Path) -> Truth:
         )
     if not path.is_dir():
         raise InputError(f"--truth {path}: there is no such file or folder")
-    if find_models(path):
+    if _models(path):
         entries = list(read_cameras(path).values())
         return PoseTruth(path, world_from_cam(entries), tuple(entry.name for entry in entries))
     if any(file.suffix.lower() in MAPS for file in path.rglob("*") if file.is_file()):
