@@ -13,8 +13,15 @@ from colmap_tco.atomic import write_text
 from colmap_tco.errors import InputError
 from colmap_tco.evaluation.align import ICP_THRESHOLD
 from colmap_tco.evaluation.eth3d import TOLERANCES, VOXEL_SIZE
-from colmap_tco.evaluation.sections import cloud_section, depth_section, pose_section, read_pixels
+from colmap_tco.evaluation.sections import (
+    cloud_section,
+    depth_section,
+    pose_section,
+    read_pixels,
+    unit_mismatch,
+)
 from colmap_tco.evaluation.sources import (
+    MESH_POINTS,
     CloudTruth,
     DepthTruth,
     Outcome,
@@ -23,7 +30,6 @@ from colmap_tco.evaluation.sources import (
     matched,
     open_outcome,
     open_truth,
-    read_points,
 )
 from colmap_tco.flags import settings
 from colmap_tco.progress import Progress
@@ -98,7 +104,8 @@ class CloudConfig:
     f_score: str = knob(
         "plain",
         "plain: shares of all points. tanks: as Tanks and Temples, both clouds thinned with voxels of half "
-        "the threshold. eth3d: as ETH3D, shares within voxels, averaged over these.",
+        "the threshold. eth3d: as ETH3D, shares within voxels, averaged over these; "
+        "with scans (.mlp) free space counts too.",
         choices=("plain", "tanks", "eth3d"),
     )
     voxel_size: float = knob(VOXEL_SIZE, "eth3d: side of the voxels, in the truth's unit.")
@@ -119,8 +126,8 @@ class EvaluateConfig:
 
     truth: tuple[Path, ...] = knob(
         (),
-        "One or more, separated by commas: a cloud or mesh; a folder of depth maps (16-bit PNG, .npy, "
-        "COLMAP's .bin) named as the images; true cameras (a COLMAP model or a TUM trajectory).",
+        "One or more, separated by commas: a cloud, a mesh, or laser scans (.mlp); a folder of depth maps "
+        "(16-bit PNG, .npy, COLMAP's .bin) named as the images; cameras (a COLMAP model, a TUM trajectory).",
     )
     model_path: Path | None = knob(
         None,
@@ -168,6 +175,8 @@ class Evaluation:
             if self.figures[name] is not None
             for table in table_of(self.figures[name])
         ]
+        if self.figures["cloud_left_out"]:
+            tables.append(f"cloud: left out, {self.figures['cloud_left_out']}")
         return "\n".join([*tables, f"figures: {self.path}"])
 
 
@@ -200,19 +209,23 @@ def evaluate(path: Path, config: EvaluateConfig, progress: Progress) -> Evaluati
         "settings": _shown(config),
         "depth": None,
         "cloud": None,
+        "cloud_left_out": "",
         "poses": None,
     }
     if pixels is not None:
         figures["depth"] = depth_section(pixels, config)
-    if surface is not None or (pixels is not None and (outcome.cloud or config.clouds.cloud == "pixels")):
+        if surface is None and poses is None:
+            figures["cloud_left_out"] = unit_mismatch(figures["depth"]["median_ratio"])
+    wanted = surface is not None or (pixels and (outcome.cloud or config.clouds.cloud == "pixels"))
+    if wanted and not figures["cloud_left_out"]:
         progress.stage("cloud", 1)
         if surface is not None:
-            truth = read_points(surface.path, config.clouds.max_points or 1_000_000, config.seed)
+            truth = surface.points(config.clouds.max_points or MESH_POINTS, config.seed)
             pairs = None if poses is None else pixels
         else:
             assert pixels is not None
             truth, pairs = pixels.truth, pixels
-        figures["cloud"] = cloud_section(outcome, truth, pairs, true_poses, config)
+        figures["cloud"] = cloud_section(outcome, truth, pairs, true_poses, config, surface)
         progress.advance(1)
     if true_poses:
         progress.stage("cameras", 1)
@@ -255,7 +268,10 @@ def _only(truths: list[Truth], kind: type[T]) -> T | None:
 
 
 def _check_comparable(
-    outcome: Outcome, depth: DepthTruth | None, poses: PoseTruth | None, surface: CloudTruth | None
+    outcome: Outcome,
+    depth: DepthTruth | None,
+    poses: PoseTruth | None,
+    surface: CloudTruth | None,
 ) -> None:
     if depth is not None and outcome.dense is None:
         raise InputError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,10 +15,18 @@ from numpy.typing import NDArray
 from colmap_tco.errors import InputError, MissingError
 from colmap_tco.evaluation.align import Similarity, icp, umeyama
 from colmap_tco.evaluation.depth import DepthFigures, depth_figures
-from colmap_tco.evaluation.eth3d import voxel_curve
+from colmap_tco.evaluation.eth3d import Scan, eth3d_curve, voxel_curve
 from colmap_tco.evaluation.maps import DepthPair, depth_pairs, true_maps
 from colmap_tco.evaluation.points import FScore, compare_clouds, f_curve, f_score
-from colmap_tco.evaluation.sources import Outcome, PoseTruth, matched, read_points, world_from_cam
+from colmap_tco.evaluation.sources import (
+    MESH_POINTS,
+    CloudTruth,
+    Outcome,
+    PoseTruth,
+    matched,
+    read_points,
+    world_from_cam,
+)
 from colmap_tco.evaluation.trajectory import pose_auc, trajectory_figures
 from colmap_tco.progress import Progress
 
@@ -124,7 +132,7 @@ def depth_section(pixels: Pixels, config: EvaluateConfig) -> dict[str, Any]:
         raise InputError(f"depth maps: {error}") from error
     both = predicted > 0
     ratio = float(np.median(truth[both].astype(np.float64) / predicted[both]))
-    if config.units.scaling == "none" and not 1 / _FAR_OFF < ratio < _FAR_OFF:
+    if config.units.scaling == "none" and unit_mismatch(ratio):
         log.warning(
             "the true depths are %.4g times the predicted ones: a difference of units rather than an error? "
             "The length of one unit of the model is given with --metres_per_unit (%.6g would fit), or left "
@@ -133,6 +141,21 @@ def depth_section(pixels: Pixels, config: EvaluateConfig) -> dict[str, Any]:
         )  # fmt: skip
     views = {name: _view_figures(*pair, every) for name, pair in pixels.pairs.items()}
     return {**asdict(every), "median_ratio": ratio, "scaling": config.units.scaling, "views": views}
+
+
+def unit_mismatch(ratio: float) -> str:
+    """Why true depths cannot be projected back from the result's own cameras; empty if they can.
+
+    Args:
+        ratio: median of true over predicted depth. Where it is far from 1, the distances of the cameras are
+            in another unit than the depths, and the points of different views do not fit together.
+    """
+    if 1 / _FAR_OFF < ratio < _FAR_OFF:
+        return ""
+    return (
+        f"for the true depths are {ratio:.4g} times the predicted ones, so that the result's cameras are not "
+        "in their unit; give --metres_per_unit, or true cameras as a further --truth"
+    )
 
 
 def _view_figures(
@@ -152,6 +175,7 @@ def cloud_section(
     pixels: Pixels | None,
     poses: Mapping[str, Floats],
     config: EvaluateConfig,
+    surface: CloudTruth | None = None,
 ) -> dict[str, Any]:
     """Distances and F-scores of the cloud after the alignment that was asked for.
 
@@ -161,10 +185,12 @@ def cloud_section(
         pixels: of the depth maps, where the truth is made of them.
         poses: name → true world_from_cam, for the alignment by camera centres.
         config: alignment, thresholds, sizes.
+        surface: what the truth was read from; ETH3D's scores look for scans in it.
 
     Raises:
         InputError: no cloud, or nothing to align by.
     """
+    scans = () if surface is None else surface.scans
     points = _points(outcome, pixels, config)
     moved_by = _aligned(points, truth, _correspondences(outcome, pixels, poses, config), config)
     moved = moved_by.apply(points)
@@ -173,7 +199,7 @@ def cloud_section(
         thinned(truth, config.clouds.max_points),
     )
     figures = compare_clouds(points_used, truth_used)
-    scores = _scores(points_used, truth_used, config)
+    scores = _scores(points_used, truth_used, scans, config)
     return {
         **asdict(figures),
         "points": len(points_used),
@@ -185,6 +211,7 @@ def cloud_section(
         "truth_from_result": moved_by.matrix.tolist(),
         "scale": moved_by.scale,
         "f_score": config.clouds.f_score,
+        "free_space": bool(scans) and config.clouds.f_score == "eth3d",
         "thresholds": [
             {"threshold": t, **asdict(score)}
             for t, score in zip(config.clouds.thresholds, scores, strict=True)
@@ -203,7 +230,7 @@ def _points(outcome: Outcome, pixels: Pixels | None, config: EvaluateConfig) -> 
         raise InputError(
             f"{outcome.path} has no cloud (fused.ply) to compare; --cloud pixels takes the depth maps instead"
         )
-    return read_points(outcome.cloud, config.clouds.max_points or 1_000_000, config.seed)
+    return read_points(outcome.cloud, config.clouds.max_points or MESH_POINTS, config.seed)
 
 
 def _correspondences(
@@ -243,7 +270,11 @@ def _aligned(
     return icp(thinned(points, config.clouds.max_points), truth, config.clouds.icp_threshold, start)
 
 
-def _scores(points: Floats, truth: Floats, config: EvaluateConfig) -> tuple[FScore, ...]:
+def _scores(
+    points: Floats, truth: Floats, scans: Sequence[Scan], config: EvaluateConfig
+) -> tuple[FScore, ...]:
+    if config.clouds.f_score == "eth3d" and scans:
+        return eth3d_curve(points, scans, config.clouds.thresholds, config.clouds.voxel_size)
     if config.clouds.f_score == "eth3d":
         return voxel_curve(points, truth, config.clouds.thresholds, config.clouds.voxel_size)
     if config.clouds.f_score == "tanks":

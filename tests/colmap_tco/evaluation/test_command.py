@@ -184,8 +184,10 @@ class TestDepth:
         self, root: Path, depths: Path, caplog: pytest.LogCaptureFixture
     ) -> None:
         with caplog.at_level(logging.WARNING):
-            run(root, config(depths, units={"metres_per_unit": 1.0}))
+            done = run(root, config(depths, units={"metres_per_unit": 1.0}))
         assert "--metres_per_unit (0.25" in caplog.text
+        assert done.figures["cloud"] is None
+        assert "cloud: left out, for the true depths are 0.25 times" in done.summary()
         caplog.clear()
         run(root, config(depths))
         assert not caplog.records
@@ -356,6 +358,50 @@ class TestCloud:
         cloud = run(root, config(half, f_score=kind, thresholds=(0.01,))).figures["cloud"]
         assert cloud["thresholds"][0]["recall"] == 1
         assert 0.3 < cloud["thresholds"][0]["precision"] < 0.7
+
+    def test_eth3d_s_scans_know_free_space(self, root: Path, tmp_path: Path) -> None:
+        """Scans from the cameras' places: what hides behind the plane is unobserved, what floats is wrong."""
+        metric = np.array([METRES] * 3 + [1])
+        eye = np.linalg.inv(np.r_[pose(2), [[0, 0, 0, 1]]])
+        plane = plane_cloud()
+        scan = Similarity(1.0, eye[:3, :3], eye[:3, 3]).inverse.apply(plane)
+        write_cloud(tmp_path / "scan one.ply", METRES * scan)
+        rows = "\n".join(" ".join(map(str, row)) for row in np.c_[eye[:, :3], eye[:, 3] * metric])
+        project = tmp_path / "scan_alignment.mlp"
+        project.write_text(
+            "<!DOCTYPE MeshLabDocument>\n<MeshLabProject>\n <MeshGroup>\n  "
+            f'<MLMesh filename="scan one.ply" label="one">\n   <MLMatrix44>\n{rows}\n</MLMatrix44>\n  '
+            "</MLMesh>\n </MeshGroup>\n</MeshLabProject>\n"
+        )
+        behind, before = (eye[:3, 3] + s * (plane[:2000] - eye[:3, 3]) for s in (1.3, 0.7))
+        scores = []
+        for extra in (plane[:0], behind, before):
+            lone = write_cloud(tmp_path / "mine.ply", np.r_[plane[:2000], extra])
+            cloud = run(lone, config(project, f_score="eth3d", thresholds=(0.02,))).figures["cloud"]
+            assert cloud["free_space"]
+            scores.append(cloud["thresholds"][0]["precision"])
+        assert scores[0] == scores[1] == 1
+        assert scores[2] == pytest.approx(0.5, abs=0.02)
+
+    def test_projects_that_are_none(self, root: Path, tmp_path: Path) -> None:
+        project = tmp_path / "p.mlp"
+        mesh = "<MeshLabProject><MeshGroup>{}</MeshGroup></MeshLabProject>"
+        for text, told in (
+            ("no xml", "not a MeshLab project"),
+            (mesh.format(""), "without meshes"),
+            (mesh.format('<MLMesh filename="a.ply"/>'), "no rigid pose"),
+            (mesh.format(f'<MLMesh filename="a.ply"><MLMatrix44>{"2 " * 16}</MLMatrix44></MLMesh>'), "rigid"),
+            (
+                mesh.format(
+                    '<MLMesh filename="a.ply"><MLMatrix44>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</MLMatrix44>'
+                    "</MLMesh>"
+                ),
+                "a.ply: there is no such cloud",
+            ),
+        ):
+            project.write_text(text)
+            with pytest.raises(InputError, match=told):
+                run(root, config(project))
 
 
 def pixel_clouds(root: Path) -> tuple[Floats, Floats]:
