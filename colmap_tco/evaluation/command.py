@@ -21,7 +21,6 @@ from colmap_tco.evaluation.sections import (
     unit_mismatch,
 )
 from colmap_tco.evaluation.sources import (
-    MESH_POINTS,
     CloudTruth,
     DepthTruth,
     Outcome,
@@ -196,43 +195,54 @@ def evaluate(path: Path, config: EvaluateConfig, progress: Progress) -> Evaluati
         raise InputError("--truth is missing: name what the result is to be compared with")
     outcome = open_outcome(path, config.model_path)
     target = _target(outcome, config)
-    truths = [open_truth(one) for one in config.truth]
-    depth, poses = _only(truths, DepthTruth), _only(truths, PoseTruth)
-    surface = _only(truths, CloudTruth)
-    _check_comparable(outcome, depth, poses, surface)
-    true_poses = matched(outcome, poses, config.match, config.max_time_difference) if poses else {}
-    pixels = read_pixels(outcome, depth.path, poses, config, progress) if depth else None
+    truths = _open_truths(config.truth)
+    _check_comparable(outcome, truths)
     figures: dict[str, Any] = {
         "kind": KIND,
         "result": str(outcome.path),
-        "truth": [str(truth.path) for truth in truths],
+        "truth": [str(one.expanduser().absolute()) for one in config.truth],
         "settings": _shown(config),
-        "depth": None,
-        "cloud": None,
-        "cloud_left_out": "",
-        "poses": None,
+        **_sections(outcome, truths, config, progress),
     }
-    if pixels is not None:
-        figures["depth"] = depth_section(pixels, config)
-        if surface is None and poses is None:
-            figures["cloud_left_out"] = unit_mismatch(figures["depth"]["median_ratio"])
-    wanted = surface is not None or (pixels and (outcome.cloud or config.clouds.cloud == "pixels"))
-    if wanted and not figures["cloud_left_out"]:
+    write_text(target, json.dumps(figures, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    return Evaluation(target, figures)
+
+
+@dataclass(frozen=True)
+class _Truths:
+    """What is true, one of a kind."""
+
+    depth: DepthTruth | None
+    surface: CloudTruth | None
+    poses: PoseTruth | None
+
+
+def _sections(
+    outcome: Outcome, truths: _Truths, config: EvaluateConfig, progress: Progress
+) -> dict[str, Any]:
+    """The parts of the evaluation that the truths allow; None for the others."""
+    depth = cloud = cameras = None
+    left_out = ""
+    true_poses = (
+        {}
+        if truths.poses is None
+        else matched(outcome, truths.poses, config.match, config.max_time_difference)
+    )
+    pixels = None
+    if truths.depth is not None:
+        pixels = read_pixels(outcome, truths.depth.path, true_poses, config, progress)
+        depth = depth_section(pixels, config)
+        if truths.surface is None and not true_poses:
+            left_out = unit_mismatch(depth["median_ratio"])
+    if not left_out and (truths.surface or (pixels and (outcome.cloud or config.clouds.cloud == "pixels"))):
         progress.stage("cloud", 1)
-        if surface is not None:
-            truth = surface.points(config.clouds.max_points or MESH_POINTS, config.seed)
-            pairs = None if poses is None else pixels
-        else:
-            assert pixels is not None
-            truth, pairs = pixels.truth, pixels
-        figures["cloud"] = cloud_section(outcome, truth, pairs, true_poses, config, surface)
+        cloud = cloud_section(outcome, truths.surface, pixels, true_poses, config)
         progress.advance(1)
     if true_poses:
         progress.stage("cameras", 1)
-        figures["poses"] = pose_section(outcome, true_poses, config)
+        cameras = pose_section(outcome, true_poses, config)
         progress.advance(1)
-    write_text(target, json.dumps(figures, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
-    return Evaluation(target, figures)
+    return {"depth": depth, "cloud": cloud, "cloud_left_out": left_out, "poses": cameras}
 
 
 def _target(outcome: Outcome, config: EvaluateConfig) -> Path:
@@ -254,12 +264,17 @@ def _target(outcome: Outcome, config: EvaluateConfig) -> Path:
     return path
 
 
-def _only(truths: list[Truth], kind: type[T]) -> T | None:
-    """The truth of a kind, or None.
+def _open_truths(paths: tuple[Path, ...]) -> _Truths:
+    """What lies at the paths.
 
     Raises:
-        InputError: there are several.
+        InputError: one is no truth, or two are of the same kind.
     """
+    truths = [open_truth(path) for path in paths]
+    return _Truths(_only(truths, DepthTruth), _only(truths, CloudTruth), _only(truths, PoseTruth))
+
+
+def _only(truths: list[Truth], kind: type[T]) -> T | None:
     found = [truth for truth in truths if isinstance(truth, kind)]
     if len(found) > 1:
         named = " and ".join(str(truth.path) for truth in truths if isinstance(truth, kind))
@@ -267,22 +282,20 @@ def _only(truths: list[Truth], kind: type[T]) -> T | None:
     return found[0] if found else None
 
 
-def _check_comparable(
-    outcome: Outcome,
-    depth: DepthTruth | None,
-    poses: PoseTruth | None,
-    surface: CloudTruth | None,
-) -> None:
-    if depth is not None and outcome.dense is None:
+def _check_comparable(outcome: Outcome, truths: _Truths) -> None:
+    if truths.depth is not None and outcome.dense is None:
         raise InputError(
-            f"{outcome.path} has no depth maps to compare with {depth.path}; name a dense workspace"
+            f"{outcome.path} has no depth maps to compare with {truths.depth.path}; name a dense workspace"
         )
-    if poses is not None and not outcome.cameras:
+    if truths.poses is not None and not outcome.cameras:
         raise InputError(
-            f"{outcome.path} has no cameras to compare with {poses.path}; name its model with --model_path"
+            f"{outcome.path} has no cameras to compare with {truths.poses.path}; name its model with "
+            "--model_path"
         )
-    if surface is not None and outcome.cloud is None and depth is None:
-        raise InputError(f"{outcome.path} has no cloud to compare with {surface.path}; densify it first")
+    if truths.surface is not None and outcome.cloud is None and truths.depth is None:
+        raise InputError(
+            f"{outcome.path} has no cloud to compare with {truths.surface.path}; densify it first"
+        )
 
 
 def _shown(config: EvaluateConfig) -> dict[str, str]:
@@ -327,7 +340,7 @@ def _cloud_table(cloud: dict[str, Any]) -> list[str]:
 def _pose_table(poses: dict[str, Any]) -> list[str]:
     lines = [f"cameras, {poses['images']} images, {poses['pairs']} pairs"]
     if poses["left_out"]:
-        lines.append("  ATE and RPE are left out: the package evo is not installed")
+        lines.append(f"  ATE and RPE are left out: {poses['left_out']}")
     else:
         lines.append(
             f"  ATE {poses['ate_rmse']:.4g}, RPE {poses['rpe_translation']:.4g} and "

@@ -22,8 +22,6 @@ from colmap_tco.evaluation.sources import (
     MESH_POINTS,
     CloudTruth,
     Outcome,
-    PoseTruth,
-    matched,
     read_points,
     world_from_cam,
 )
@@ -60,15 +58,19 @@ class Pixels:
 
 
 def read_pixels(
-    outcome: Outcome, folder: Path, poses: PoseTruth | None, config: EvaluateConfig, progress: Progress
+    outcome: Outcome,
+    folder: Path,
+    true_poses: Mapping[str, Floats],
+    config: EvaluateConfig,
+    progress: Progress,
 ) -> Pixels:
     """Read all true depth maps and look the predictions up.
 
     Args:
         outcome: with a dense workspace.
         folder: of the true maps.
-        poses: true cameras, which the true depth is then projected back from; None: those of the result,
-            scaled by ``metres_per_unit``.
+        true_poses: name → true world_from_cam, which the true depth is then projected back from; empty: the
+            result's own, scaled by ``metres_per_unit``.
         config: units and sizes.
         progress: counts the images.
 
@@ -77,13 +79,12 @@ def read_pixels(
     """
     files = true_maps(outcome, folder)
     count = len(files)
-    true_poses = {} if poses is None else matched(outcome, poses, config.match, config.max_time_difference)
     progress.stage("depth maps", count)
     each = math.ceil(config.clouds.max_points / count) if config.clouds.max_points else None
     pairs, seen, there, truth = {}, [], [], []
     for pair in depth_pairs(outcome, files, config.units.depth_unit, max(1, config.max_pixels // count)):
         pairs[pair.name] = (pair.predicted * np.float32(config.units.metres_per_unit), pair.truth)
-        if poses is None or pair.name in true_poses:
+        if not true_poses or pair.name in true_poses:
             mine, yours, every = _as_points(
                 pair, true_poses.get(pair.name), config.units.metres_per_unit, each
             )
@@ -171,38 +172,43 @@ def _view_figures(
 
 def cloud_section(
     outcome: Outcome,
-    truth: Floats,
+    surface: CloudTruth | None,
     pixels: Pixels | None,
     poses: Mapping[str, Floats],
     config: EvaluateConfig,
-    surface: CloudTruth | None = None,
 ) -> dict[str, Any]:
     """Distances and F-scores of the cloud after the alignment that was asked for.
 
     Args:
         outcome: the result.
-        truth: (M, 3) true points.
-        pixels: of the depth maps, where the truth is made of them.
+        surface: the truth; None: the points of the true depth maps.
+        pixels: of the depth maps, if any are true.
         poses: name → true world_from_cam, for the alignment by camera centres.
         config: alignment, thresholds, sizes.
-        surface: what the truth was read from; ETH3D's scores look for scans in it.
 
     Raises:
         InputError: no cloud, or nothing to align by.
     """
-    scans = () if surface is None else surface.scans
+    scans: tuple[Scan, ...] = ()
+    if surface is not None:
+        scans = surface.scans
+        truth = surface.points(config.clouds.max_points or MESH_POINTS, config.seed)
+    else:
+        assert pixels is not None, "without a cloud the truth is made of depth maps"
+        truth = pixels.truth
     points = _points(outcome, pixels, config)
-    moved_by = _aligned(points, truth, _correspondences(outcome, pixels, poses, config), config)
-    moved = moved_by.apply(points)
-    points_used, truth_used = (
-        thinned(moved, config.clouds.max_points),
-        thinned(truth, config.clouds.max_points),
-    )
-    figures = compare_clouds(points_used, truth_used)
-    scores = _scores(points_used, truth_used, scans, config)
+    # Pixels correspond in the frame of a cloud of its own only where true cameras say how.
+    pairs = pixels if surface is None or poses else None
+    moved_by = _aligned(points, truth, _correspondences(outcome, pairs, poses, config), config)
+    used, truth_used = (thinned(cloud, config.clouds.max_points) for cloud in (moved_by.apply(points), truth))
+    try:
+        figures = compare_clouds(used, truth_used)
+        scores = _scores(used, truth_used, scans, config)
+    except ValueError as error:
+        raise InputError(f"the cloud cannot be compared: {error}") from error
     return {
         **asdict(figures),
-        "points": len(points_used),
+        "points": len(used),
         "truth_points": len(truth_used),
         "of_points": len(points),
         "of_truth_points": len(truth),
@@ -292,10 +298,10 @@ def thinned(points: Floats, most: int) -> Floats:
 def pose_section(outcome: Outcome, poses: Mapping[str, Floats], config: EvaluateConfig) -> dict[str, Any]:
     """ATE, RPE and angular accuracy of the cameras of the images that have a true pose, ordered by name.
 
-    Without evo there is no ATE and RPE; the figures then say why.
+    Without evo, or where the cameras determine no alignment, there is no ATE and RPE; the figures say why.
 
     Raises:
-        InputError: fewer than two images, or cameras that determine no alignment.
+        InputError: fewer than two images, or matrices that are no poses.
     """
     names = sorted(poses)
     estimated = Similarity(config.units.metres_per_unit).poses(
@@ -305,11 +311,12 @@ def pose_section(outcome: Outcome, poses: Mapping[str, Floats], config: Evaluate
     figures: dict[str, Any] = {"images": len(names), "with_scale": config.units.pose_scale, "left_out": ""}
     try:
         angles = pose_auc(estimated, true)
-        figures |= {field.name: getattr(angles, field.name) for field in fields(angles)}
-        figures |= asdict(trajectory_figures(estimated, true, config.units.pose_scale))
     except ValueError as error:
         raise InputError(f"cameras of {outcome.path}: {error}") from error
-    except MissingError as error:
-        log.warning("%s", error)
+    figures |= {field.name: getattr(angles, field.name) for field in fields(angles)}
+    try:
+        figures |= asdict(trajectory_figures(estimated, true, config.units.pose_scale))
+    except (ValueError, MissingError) as error:
+        log.warning("ATE and RPE are left out: %s", error)
         figures["left_out"] = str(error)
     return figures

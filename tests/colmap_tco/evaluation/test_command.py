@@ -306,6 +306,16 @@ class TestCloud:
         assert cloud["accuracy_median"] < 0.02 * METRES
         assert done.figures["poses"]["ate_rmse"] < 1e-6
 
+    def test_the_pixels_of_the_maps_against_a_cloud(self, root: Path, depths: Path, tmp_path: Path) -> None:
+        """Two truths: the depths choose the pixels, the cloud is what they are compared with."""
+        truth = write_cloud(tmp_path / "truth.ply", METRES * plane_cloud())
+        done = run(root, config(truth, depths, cloud="pixels"))
+        assert done.figures["depth"]["d2"] > 0.999
+        cloud = done.figures["cloud"]
+        assert cloud["of_points"] > 0.999 * COUNT * WIDTH * HEIGHT
+        assert cloud["truth_points"] == 20000
+        assert cloud["accuracy_median"] < 0.02 * METRES
+
     def test_icp_takes_a_small_rigid_error_out(self, root: Path, tmp_path: Path) -> None:
         """Along the plane nothing is fixed, so it is the distance across that must vanish."""
         moved = METRES * plane_cloud() + 0.03 * NORMAL
@@ -499,7 +509,14 @@ class TestPoses:
         done = run(root, config(write_true_model(tmp_path / "cameras", true_poses())))
         assert "colmap-tco[evaluate]" in done.figures["poses"]["left_out"]
         assert done.figures["poses"]["auc"] == pytest.approx([1] * 4)
-        assert "evo is not installed" in done.summary()
+        assert "ATE and RPE are left out" in done.summary()
+
+    def test_cameras_on_a_line_have_angles_alone(self, root: Path, tmp_path: Path) -> None:
+        line = true_poses()
+        line[:, :3, 3] = np.outer(np.arange(COUNT), [1, 2, 3])
+        poses = run(root, config(write_true_model(tmp_path / "cameras", line))).figures["poses"]
+        assert "on one line" in poses["left_out"] and "ate_rmse" not in poses
+        assert poses["rra"] == pytest.approx([1] * 4)
 
 
 class TestFaults:
@@ -560,6 +577,10 @@ class TestFaults:
     def test_no_correspondence_for_a_similarity(self, root: Path, tmp_path: Path) -> None:
         truth = write_cloud(tmp_path / "truth.ply", plane_cloud(100))
         self.refused(root, config(truth, align="sim3"), "--truth scan.ply,cameras")
+
+    def test_clouds_without_enough_points(self, root: Path, tmp_path: Path) -> None:
+        truth = write_cloud(tmp_path / "truth.ply", plane_cloud(2))
+        self.refused(root, config(truth), "at least 3 points")
 
     def test_cameras_of_other_images(self, root: Path, tmp_path: Path) -> None:
         model = write_true_model(tmp_path / "m", true_poses())
