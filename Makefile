@@ -18,7 +18,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit("colmap-tco needs Python 3.10 or newer; name one with make PYTHON=…" if sys.version_info < (3, 10) else 0)'
 	@$(PYTHON) -c 'import ensurepip, venv' || { echo "Python's venv module is missing; on Debian: apt install python3-venv" >&2; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) --constraint constraints.txt --editable ".[dev,hub,las,da3]"
+	$(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) --constraint constraints.txt --editable ".[dev,hub,las,da3,evaluate]"
 	$(BIN)/python -m pip install --disable-pip-version-check --no-deps depth-anything-3==0.1.1 || echo "Without the package depth-anything-3, --backbone da3 and its tests are left out" >&2
 	@touch $@
 

@@ -107,7 +107,7 @@ def test_every_third_party_import_is_declared() -> None:
 
 def test_the_pins_lie_in_the_declared_ranges() -> None:
     versions = pins()
-    for requirement in requirements("hub", "las", "da3", "dev"):
+    for requirement in requirements("hub", "las", "da3", "evaluate", "dev"):
         name = canonicalize_name(requirement.name)
         assert name in versions, f"constraints.txt does not pin {name}"
         assert versions[name] in requirement.specifier, f"{name} {versions[name]} is outside its range"
@@ -115,7 +115,7 @@ def test_the_pins_lie_in_the_declared_ranges() -> None:
 
 def test_every_dependency_of_a_dependency_is_pinned() -> None:
     """A fresh machine must get the same versions tomorrow: nothing is left for pip to choose."""
-    versions, seen, left = pins(), set(), requirements("hub", "las", "da3", "dev")
+    versions, seen, left = pins(), set(), requirements("hub", "las", "da3", "evaluate", "dev")
     while left:
         requirement = left.pop()
         name = canonicalize_name(requirement.name)

@@ -13,7 +13,13 @@ from colmap_tco.atomic import write_text
 from colmap_tco.errors import InputError
 from colmap_tco.evaluation.align import ICP_THRESHOLD
 from colmap_tco.evaluation.eth3d import TOLERANCES, VOXEL_SIZE
-from colmap_tco.evaluation.sections import cloud_section, depth_section, pose_section, read_pixels
+from colmap_tco.evaluation.sections import (
+    cloud_section,
+    depth_section,
+    pose_section,
+    read_pixels,
+    unit_mismatch,
+)
 from colmap_tco.evaluation.sources import (
     CloudTruth,
     DepthTruth,
@@ -23,7 +29,6 @@ from colmap_tco.evaluation.sources import (
     matched,
     open_outcome,
     open_truth,
-    read_points,
 )
 from colmap_tco.flags import settings
 from colmap_tco.progress import Progress
@@ -98,7 +103,8 @@ class CloudConfig:
     f_score: str = knob(
         "plain",
         "plain: shares of all points. tanks: as Tanks and Temples, both clouds thinned with voxels of half "
-        "the threshold. eth3d: as ETH3D, shares within voxels, averaged over these.",
+        "the threshold. eth3d: as ETH3D, shares within voxels, averaged over these; "
+        "with scans (.mlp) free space counts too.",
         choices=("plain", "tanks", "eth3d"),
     )
     voxel_size: float = knob(VOXEL_SIZE, "eth3d: side of the voxels, in the truth's unit.")
@@ -119,8 +125,8 @@ class EvaluateConfig:
 
     truth: tuple[Path, ...] = knob(
         (),
-        "One or more, separated by commas: a cloud or mesh; a folder of depth maps (16-bit PNG, .npy, "
-        "COLMAP's .bin) named as the images; true cameras (a COLMAP model or a TUM trajectory).",
+        "One or more, separated by commas: a cloud, a mesh, or laser scans (.mlp); a folder of depth maps "
+        "(16-bit PNG, .npy, COLMAP's .bin) named as the images; cameras (a COLMAP model, a TUM trajectory).",
     )
     model_path: Path | None = knob(
         None,
@@ -168,6 +174,8 @@ class Evaluation:
             if self.figures[name] is not None
             for table in table_of(self.figures[name])
         ]
+        if self.figures["cloud_left_out"]:
+            tables.append(f"cloud: left out, {self.figures['cloud_left_out']}")
         return "\n".join([*tables, f"figures: {self.path}"])
 
 
@@ -187,39 +195,54 @@ def evaluate(path: Path, config: EvaluateConfig, progress: Progress) -> Evaluati
         raise InputError("--truth is missing: name what the result is to be compared with")
     outcome = open_outcome(path, config.model_path)
     target = _target(outcome, config)
-    truths = [open_truth(one) for one in config.truth]
-    depth, poses = _only(truths, DepthTruth), _only(truths, PoseTruth)
-    surface = _only(truths, CloudTruth)
-    _check_comparable(outcome, depth, poses, surface)
-    true_poses = matched(outcome, poses, config.match, config.max_time_difference) if poses else {}
-    pixels = read_pixels(outcome, depth.path, poses, config, progress) if depth else None
+    truths = _open_truths(config.truth)
+    _check_comparable(outcome, truths)
     figures: dict[str, Any] = {
         "kind": KIND,
         "result": str(outcome.path),
-        "truth": [str(truth.path) for truth in truths],
+        "truth": [str(one.expanduser().absolute()) for one in config.truth],
         "settings": _shown(config),
-        "depth": None,
-        "cloud": None,
-        "poses": None,
+        **_sections(outcome, truths, config, progress),
     }
-    if pixels is not None:
-        figures["depth"] = depth_section(pixels, config)
-    if surface is not None or (pixels is not None and (outcome.cloud or config.clouds.cloud == "pixels")):
+    write_text(target, json.dumps(figures, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    return Evaluation(target, figures)
+
+
+@dataclass(frozen=True)
+class _Truths:
+    """What is true, one of a kind."""
+
+    depth: DepthTruth | None
+    surface: CloudTruth | None
+    poses: PoseTruth | None
+
+
+def _sections(
+    outcome: Outcome, truths: _Truths, config: EvaluateConfig, progress: Progress
+) -> dict[str, Any]:
+    """The parts of the evaluation that the truths allow; None for the others."""
+    depth = cloud = cameras = None
+    left_out = ""
+    true_poses = (
+        {}
+        if truths.poses is None
+        else matched(outcome, truths.poses, config.match, config.max_time_difference)
+    )
+    pixels = None
+    if truths.depth is not None:
+        pixels = read_pixels(outcome, truths.depth.path, true_poses, config, progress)
+        depth = depth_section(pixels, config)
+        if truths.surface is None and not true_poses:
+            left_out = unit_mismatch(depth["median_ratio"])
+    if not left_out and (truths.surface or (pixels and (outcome.cloud or config.clouds.cloud == "pixels"))):
         progress.stage("cloud", 1)
-        if surface is not None:
-            truth = read_points(surface.path, config.clouds.max_points or 1_000_000, config.seed)
-            pairs = None if poses is None else pixels
-        else:
-            assert pixels is not None
-            truth, pairs = pixels.truth, pixels
-        figures["cloud"] = cloud_section(outcome, truth, pairs, true_poses, config)
+        cloud = cloud_section(outcome, truths.surface, pixels, true_poses, config)
         progress.advance(1)
     if true_poses:
         progress.stage("cameras", 1)
-        figures["poses"] = pose_section(outcome, true_poses, config)
+        cameras = pose_section(outcome, true_poses, config)
         progress.advance(1)
-    write_text(target, json.dumps(figures, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
-    return Evaluation(target, figures)
+    return {"depth": depth, "cloud": cloud, "cloud_left_out": left_out, "poses": cameras}
 
 
 def _target(outcome: Outcome, config: EvaluateConfig) -> Path:
@@ -241,12 +264,17 @@ def _target(outcome: Outcome, config: EvaluateConfig) -> Path:
     return path
 
 
-def _only(truths: list[Truth], kind: type[T]) -> T | None:
-    """The truth of a kind, or None.
+def _open_truths(paths: tuple[Path, ...]) -> _Truths:
+    """What lies at the paths.
 
     Raises:
-        InputError: there are several.
+        InputError: one is no truth, or two are of the same kind.
     """
+    truths = [open_truth(path) for path in paths]
+    return _Truths(_only(truths, DepthTruth), _only(truths, CloudTruth), _only(truths, PoseTruth))
+
+
+def _only(truths: list[Truth], kind: type[T]) -> T | None:
     found = [truth for truth in truths if isinstance(truth, kind)]
     if len(found) > 1:
         named = " and ".join(str(truth.path) for truth in truths if isinstance(truth, kind))
@@ -254,19 +282,20 @@ def _only(truths: list[Truth], kind: type[T]) -> T | None:
     return found[0] if found else None
 
 
-def _check_comparable(
-    outcome: Outcome, depth: DepthTruth | None, poses: PoseTruth | None, surface: CloudTruth | None
-) -> None:
-    if depth is not None and outcome.dense is None:
+def _check_comparable(outcome: Outcome, truths: _Truths) -> None:
+    if truths.depth is not None and outcome.dense is None:
         raise InputError(
-            f"{outcome.path} has no depth maps to compare with {depth.path}; name a dense workspace"
+            f"{outcome.path} has no depth maps to compare with {truths.depth.path}; name a dense workspace"
         )
-    if poses is not None and not outcome.cameras:
+    if truths.poses is not None and not outcome.cameras:
         raise InputError(
-            f"{outcome.path} has no cameras to compare with {poses.path}; name its model with --model_path"
+            f"{outcome.path} has no cameras to compare with {truths.poses.path}; name its model with "
+            "--model_path"
         )
-    if surface is not None and outcome.cloud is None and depth is None:
-        raise InputError(f"{outcome.path} has no cloud to compare with {surface.path}; densify it first")
+    if truths.surface is not None and outcome.cloud is None and truths.depth is None:
+        raise InputError(
+            f"{outcome.path} has no cloud to compare with {truths.surface.path}; densify it first"
+        )
 
 
 def _shown(config: EvaluateConfig) -> dict[str, str]:
@@ -311,7 +340,7 @@ def _cloud_table(cloud: dict[str, Any]) -> list[str]:
 def _pose_table(poses: dict[str, Any]) -> list[str]:
     lines = [f"cameras, {poses['images']} images, {poses['pairs']} pairs"]
     if poses["left_out"]:
-        lines.append("  ATE and RPE are left out: the package evo is not installed")
+        lines.append(f"  ATE and RPE are left out: {poses['left_out']}")
     else:
         lines.append(
             f"  ATE {poses['ate_rmse']:.4g}, RPE {poses['rpe_translation']:.4g} and "

@@ -8,7 +8,7 @@ truth is never interpolated. Undistortion does not turn the camera, so depth sta
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -54,12 +54,12 @@ class DepthPair:
     world_from_cam: Floats
 
 
-def depth_pairs(outcome: Outcome, folder: Path, unit: float, most: int) -> Iterator[DepthPair]:
-    """The pairs of all images that have a true map, in the order of their names.
+def depth_pairs(outcome: Outcome, files: Mapping[str, Path], unit: float, most: int) -> Iterator[DepthPair]:
+    """The pairs of images, one after the other.
 
     Args:
         outcome: with a dense workspace.
-        folder: of the true maps.
+        files: name of the image → true map, as :func:`true_maps` finds them.
         unit: of the numbers in them; 0: 0.001 for PNG, 1 for others.
         most: pixels of an image; of more, a random choice.
 
@@ -68,7 +68,7 @@ def depth_pairs(outcome: Outcome, folder: Path, unit: float, most: int) -> Itera
     """
     assert outcome.dense is not None
     views = {view.name: view for view in outcome.dense.views}
-    for name, file in true_maps(outcome, folder).items():
+    for name, file in files.items():
         entry, view = outcome.cameras[name], views.get(name)
         truth = read_depth(file, unit)
         _check_shape(file, truth.shape, entry)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,10 +15,16 @@ from numpy.typing import NDArray
 from colmap_tco.errors import InputError, MissingError
 from colmap_tco.evaluation.align import Similarity, icp, umeyama
 from colmap_tco.evaluation.depth import DepthFigures, depth_figures
-from colmap_tco.evaluation.eth3d import voxel_curve
+from colmap_tco.evaluation.eth3d import Scan, eth3d_curve, voxel_curve
 from colmap_tco.evaluation.maps import DepthPair, depth_pairs, true_maps
 from colmap_tco.evaluation.points import FScore, compare_clouds, f_curve, f_score
-from colmap_tco.evaluation.sources import Outcome, PoseTruth, matched, read_points, world_from_cam
+from colmap_tco.evaluation.sources import (
+    MESH_POINTS,
+    CloudTruth,
+    Outcome,
+    read_points,
+    world_from_cam,
+)
 from colmap_tco.evaluation.trajectory import pose_auc, trajectory_figures
 from colmap_tco.progress import Progress
 
@@ -52,29 +58,33 @@ class Pixels:
 
 
 def read_pixels(
-    outcome: Outcome, folder: Path, poses: PoseTruth | None, config: EvaluateConfig, progress: Progress
+    outcome: Outcome,
+    folder: Path,
+    true_poses: Mapping[str, Floats],
+    config: EvaluateConfig,
+    progress: Progress,
 ) -> Pixels:
     """Read all true depth maps and look the predictions up.
 
     Args:
         outcome: with a dense workspace.
         folder: of the true maps.
-        poses: true cameras, which the true depth is then projected back from; None: those of the result,
-            scaled by ``metres_per_unit``.
+        true_poses: name → true world_from_cam, which the true depth is then projected back from; empty: the
+            result's own, scaled by ``metres_per_unit``.
         config: units and sizes.
         progress: counts the images.
 
     Raises:
         InputError: see :func:`colmap_tco.evaluation.maps.depth_pairs`.
     """
-    count = len(true_maps(outcome, folder))
-    true_poses = {} if poses is None else matched(outcome, poses, config.match, config.max_time_difference)
+    files = true_maps(outcome, folder)
+    count = len(files)
     progress.stage("depth maps", count)
     each = math.ceil(config.clouds.max_points / count) if config.clouds.max_points else None
     pairs, seen, there, truth = {}, [], [], []
-    for pair in depth_pairs(outcome, folder, config.units.depth_unit, max(1, config.max_pixels // count)):
+    for pair in depth_pairs(outcome, files, config.units.depth_unit, max(1, config.max_pixels // count)):
         pairs[pair.name] = (pair.predicted * np.float32(config.units.metres_per_unit), pair.truth)
-        if poses is None or pair.name in true_poses:
+        if not true_poses or pair.name in true_poses:
             mine, yours, every = _as_points(
                 pair, true_poses.get(pair.name), config.units.metres_per_unit, each
             )
@@ -123,7 +133,7 @@ def depth_section(pixels: Pixels, config: EvaluateConfig) -> dict[str, Any]:
         raise InputError(f"depth maps: {error}") from error
     both = predicted > 0
     ratio = float(np.median(truth[both].astype(np.float64) / predicted[both]))
-    if config.units.scaling == "none" and not 1 / _FAR_OFF < ratio < _FAR_OFF:
+    if config.units.scaling == "none" and unit_mismatch(ratio):
         log.warning(
             "the true depths are %.4g times the predicted ones: a difference of units rather than an error? "
             "The length of one unit of the model is given with --metres_per_unit (%.6g would fit), or left "
@@ -132,6 +142,21 @@ def depth_section(pixels: Pixels, config: EvaluateConfig) -> dict[str, Any]:
         )  # fmt: skip
     views = {name: _view_figures(*pair, every) for name, pair in pixels.pairs.items()}
     return {**asdict(every), "median_ratio": ratio, "scaling": config.units.scaling, "views": views}
+
+
+def unit_mismatch(ratio: float) -> str:
+    """Why true depths cannot be projected back from the result's own cameras; empty if they can.
+
+    Args:
+        ratio: median of true over predicted depth. Where it is far from 1, the distances of the cameras are
+            in another unit than the depths, and the points of different views do not fit together.
+    """
+    if 1 / _FAR_OFF < ratio < _FAR_OFF:
+        return ""
+    return (
+        f"for the true depths are {ratio:.4g} times the predicted ones, so that the result's cameras are not "
+        "in their unit; give --metres_per_unit, or true cameras as a further --truth"
+    )
 
 
 def _view_figures(
@@ -147,7 +172,7 @@ def _view_figures(
 
 def cloud_section(
     outcome: Outcome,
-    truth: Floats,
+    surface: CloudTruth | None,
     pixels: Pixels | None,
     poses: Mapping[str, Floats],
     config: EvaluateConfig,
@@ -156,26 +181,34 @@ def cloud_section(
 
     Args:
         outcome: the result.
-        truth: (M, 3) true points.
-        pixels: of the depth maps, where the truth is made of them.
+        surface: the truth; None: the points of the true depth maps.
+        pixels: of the depth maps, if any are true.
         poses: name → true world_from_cam, for the alignment by camera centres.
         config: alignment, thresholds, sizes.
 
     Raises:
         InputError: no cloud, or nothing to align by.
     """
+    scans: tuple[Scan, ...] = ()
+    if surface is not None:
+        scans = surface.scans
+        truth = surface.points(config.clouds.max_points or MESH_POINTS, config.seed)
+    else:
+        assert pixels is not None, "without a cloud the truth is made of depth maps"
+        truth = pixels.truth
     points = _points(outcome, pixels, config)
-    moved_by = _aligned(points, truth, _correspondences(outcome, pixels, poses, config), config)
-    moved = moved_by.apply(points)
-    points_used, truth_used = (
-        thinned(moved, config.clouds.max_points),
-        thinned(truth, config.clouds.max_points),
-    )
-    figures = compare_clouds(points_used, truth_used)
-    scores = _scores(points_used, truth_used, config)
+    # Pixels correspond in the frame of a cloud of its own only where true cameras say how.
+    pairs = pixels if surface is None or poses else None
+    moved_by = _aligned(points, truth, _correspondences(outcome, pairs, poses, config), config)
+    used, truth_used = (thinned(cloud, config.clouds.max_points) for cloud in (moved_by.apply(points), truth))
+    try:
+        figures = compare_clouds(used, truth_used)
+        scores = _scores(used, truth_used, scans, config)
+    except ValueError as error:
+        raise InputError(f"the cloud cannot be compared: {error}") from error
     return {
         **asdict(figures),
-        "points": len(points_used),
+        "points": len(used),
         "truth_points": len(truth_used),
         "of_points": len(points),
         "of_truth_points": len(truth),
@@ -184,6 +217,7 @@ def cloud_section(
         "truth_from_result": moved_by.matrix.tolist(),
         "scale": moved_by.scale,
         "f_score": config.clouds.f_score,
+        "free_space": bool(scans) and config.clouds.f_score == "eth3d",
         "thresholds": [
             {"threshold": t, **asdict(score)}
             for t, score in zip(config.clouds.thresholds, scores, strict=True)
@@ -202,7 +236,7 @@ def _points(outcome: Outcome, pixels: Pixels | None, config: EvaluateConfig) -> 
         raise InputError(
             f"{outcome.path} has no cloud (fused.ply) to compare; --cloud pixels takes the depth maps instead"
         )
-    return read_points(outcome.cloud, config.clouds.max_points or 1_000_000, config.seed)
+    return read_points(outcome.cloud, config.clouds.max_points or MESH_POINTS, config.seed)
 
 
 def _correspondences(
@@ -242,7 +276,11 @@ def _aligned(
     return icp(thinned(points, config.clouds.max_points), truth, config.clouds.icp_threshold, start)
 
 
-def _scores(points: Floats, truth: Floats, config: EvaluateConfig) -> tuple[FScore, ...]:
+def _scores(
+    points: Floats, truth: Floats, scans: Sequence[Scan], config: EvaluateConfig
+) -> tuple[FScore, ...]:
+    if config.clouds.f_score == "eth3d" and scans:
+        return eth3d_curve(points, scans, config.clouds.thresholds, config.clouds.voxel_size)
     if config.clouds.f_score == "eth3d":
         return voxel_curve(points, truth, config.clouds.thresholds, config.clouds.voxel_size)
     if config.clouds.f_score == "tanks":
@@ -260,10 +298,10 @@ def thinned(points: Floats, most: int) -> Floats:
 def pose_section(outcome: Outcome, poses: Mapping[str, Floats], config: EvaluateConfig) -> dict[str, Any]:
     """ATE, RPE and angular accuracy of the cameras of the images that have a true pose, ordered by name.
 
-    Without evo there is no ATE and RPE; the figures then say why.
+    Without evo, or where the cameras determine no alignment, there is no ATE and RPE; the figures say why.
 
     Raises:
-        InputError: fewer than two images, or cameras that determine no alignment.
+        InputError: fewer than two images, or matrices that are no poses.
     """
     names = sorted(poses)
     estimated = Similarity(config.units.metres_per_unit).poses(
@@ -273,11 +311,12 @@ def pose_section(outcome: Outcome, poses: Mapping[str, Floats], config: Evaluate
     figures: dict[str, Any] = {"images": len(names), "with_scale": config.units.pose_scale, "left_out": ""}
     try:
         angles = pose_auc(estimated, true)
-        figures |= {field.name: getattr(angles, field.name) for field in fields(angles)}
-        figures |= asdict(trajectory_figures(estimated, true, config.units.pose_scale))
     except ValueError as error:
         raise InputError(f"cameras of {outcome.path}: {error}") from error
-    except MissingError as error:
-        log.warning("%s", error)
+    figures |= {field.name: getattr(angles, field.name) for field in fields(angles)}
+    try:
+        figures |= asdict(trajectory_figures(estimated, true, config.units.pose_scale))
+    except (ValueError, MissingError) as error:
+        log.warning("ATE and RPE are left out: %s", error)
         figures["left_out"] = str(error)
     return figures

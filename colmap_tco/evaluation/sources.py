@@ -7,6 +7,7 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,8 @@ from numpy.typing import NDArray
 from colmap_tco import _pycolmap
 from colmap_tco._pycolmap import Registered
 from colmap_tco.errors import InputError
-from colmap_tco.evaluation.checks import open3d
+from colmap_tco.evaluation.checks import as_poses, open3d
+from colmap_tco.evaluation.eth3d import Scan
 from colmap_tco.export.dense import Dense, open_dense
 from colmap_tco.workspace import DensePaths, dense_paths, find_models
 
@@ -25,7 +27,10 @@ Floats = NDArray[np.float64]
 CLOUDS = (".ply", ".pcd", ".xyz", ".xyzn", ".pts")
 MESHES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
 TRAJECTORIES = (".txt", ".tum")
+SCANS = ".mlp"
 MAPS = (".png", ".npy", ".bin")
+MESH_POINTS = 1_000_000
+"""Points spread over a mesh where no other number is asked for."""
 _LISTED = 5
 
 
@@ -50,9 +55,21 @@ class Outcome:
 
 @dataclass(frozen=True)
 class CloudTruth:
-    """A cloud or mesh."""
+    """A cloud, a mesh, or laser scans.
+
+    Attributes:
+        path: of the file.
+        scans: with the positions of the scanner, where these are known.
+    """
 
     path: Path
+    scans: tuple[Scan, ...] = ()
+
+    def points(self, samples: int, seed: int) -> Floats:
+        """All points (N, 3); of a mesh, see :func:`read_points`."""
+        if self.scans:
+            return np.concatenate([scan.world for scan in self.scans])
+        return read_points(self.path, samples, seed)
 
 
 @dataclass(frozen=True)
@@ -109,7 +126,7 @@ def open_outcome(path: Path, model_path: Path | None = None) -> Outcome:
         cloud = dense.paths.ply if dense.paths.ply.is_file() else None
         figures = dense.paths.root / "evaluation.json" if ours else beside
         return Outcome(path, dense, cloud, cameras, figures)
-    if not model_path and not find_models(path):
+    if not model_path and not _models(path):
         raise InputError(
             f"{path}: no dense workspace (dense-tco/, or sparse/ and stereo/), no COLMAP model, and no cloud"
         )
@@ -123,11 +140,19 @@ def _original_model(paths: DensePaths) -> Path:
             noted = json.loads(paths.report.read_text(encoding="utf-8")).get("workspace", {}).get("model", "")
         except (ValueError, AttributeError) as error:
             raise InputError(f"{paths.report}: not a report of colmap-tco ({error})") from error
-        if noted and find_models(Path(noted)):
+        if noted and _models(Path(noted)):
             return Path(noted)
-    if paths.root.name == dense_paths(paths.root).root.name and find_models(paths.root.parent):
+    if paths.root.name == dense_paths(paths.root).root.name and _models(paths.root.parent):
         return paths.root.parent
     return paths.sparse
+
+
+def _models(folder: Path) -> list[Path]:
+    """Models in a folder, which may be the one that COLMAP's mapper wrote them into."""
+    if not folder.is_dir():
+        return []
+    inside = [sub for sub in sorted(folder.iterdir()) if sub.is_dir() and sub in find_models(sub)]
+    return find_models(folder) or inside
 
 
 def read_cameras(folder: Path) -> dict[str, Registered]:
@@ -136,7 +161,7 @@ def read_cameras(folder: Path) -> dict[str, Registered]:
     Raises:
         InputError: no model, or none that can be read and has poses.
     """
-    folders = find_models(folder.expanduser().absolute()) if folder.is_dir() else []
+    folders = _models(folder.expanduser().absolute())
     if not folders:
         raise InputError(f"{folder}: no COLMAP model, neither in it nor in its sparse/")
     models = [_pycolmap.registered(_pycolmap.read_model(one)) for one in folders]
@@ -169,19 +194,45 @@ def open_truth(path: Path) -> Truth:
             return CloudTruth(path)
         if path.suffix.lower() in TRAJECTORIES:
             return read_tum(path)
+        if path.suffix.lower() == SCANS:
+            return read_scans(path)
         raise InputError(
             f"{path}: not a truth that can be read: clouds ({', '.join(CLOUDS)}), meshes "
-            f"({', '.join(MESHES)}), TUM trajectories ({', '.join(TRAJECTORIES)}), and folders with depth "
-            "maps or a COLMAP model"
+            f"({', '.join(MESHES)}), laser scans (a MeshLab project, {SCANS}), TUM trajectories "
+            f"({', '.join(TRAJECTORIES)}), and folders with depth maps or a COLMAP model"
         )
     if not path.is_dir():
         raise InputError(f"--truth {path}: there is no such file or folder")
-    if find_models(path):
+    if _models(path):
         entries = list(read_cameras(path).values())
         return PoseTruth(path, world_from_cam(entries), tuple(entry.name for entry in entries))
     if any(file.suffix.lower() in MAPS for file in path.rglob("*") if file.is_file()):
         return DepthTruth(path)
     raise InputError(f"{path}: a folder without depth maps ({', '.join(MAPS)}) and without a COLMAP model")
+
+
+def read_scans(path: Path) -> CloudTruth:
+    """The laser scans of a MeshLab project, in which each ``MLMesh`` has a file and ``MLMatrix44``, its pose.
+
+    Raises:
+        InputError: it is no such project, a pose is not rigid, or a scan is missing or empty.
+        MissingError: Open3D cannot be imported.
+    """
+    try:
+        meshes = list(ElementTree.parse(path).getroot().iterfind("MeshGroup/MLMesh"))
+    except ElementTree.ParseError as error:
+        raise InputError(f"{path}: not a MeshLab project ({error})") from error
+    if not meshes:
+        raise InputError(f"{path}: a MeshLab project without meshes")
+    scans = []
+    for mesh in meshes:
+        name, text = mesh.get("filename", ""), mesh.findtext("MLMatrix44", "")
+        try:
+            (pose,) = as_poses(np.array(text.split(), np.float64).reshape(1, 4, 4), "a scan's")
+        except ValueError as error:
+            raise InputError(f"{path}: {name or 'a mesh'} has no rigid pose ({error})") from error
+        scans.append(Scan(read_points(path.parent / name, 0, 0), pose))
+    return CloudTruth(path, tuple(scans))
 
 
 def read_tum(path: Path) -> PoseTruth:
@@ -224,7 +275,7 @@ def _rotations(xyzw: Floats) -> Floats:
 
 
 def read_points(path: Path, samples: int, seed: int) -> Floats:
-    """Points (N, 3) of a cloud, or so many spread evenly over the triangles of a mesh.
+    """Points (N, 3) of a cloud, or so many spread evenly over the triangles of a mesh; 0: its vertices.
 
     Raises:
         InputError: the file is missing, cannot be read, or has neither points nor triangles.
@@ -236,7 +287,7 @@ def read_points(path: Path, samples: int, seed: int) -> Floats:
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         if path.suffix.lower() in MESHES:
             mesh = o3d.io.read_triangle_mesh(str(path))
-            if len(mesh.triangles):
+            if samples and len(mesh.triangles):
                 log.info("%s: a mesh of %d triangles, %d points on it", path, len(mesh.triangles), samples)
                 o3d.utility.random.seed(seed)
                 return np.array(mesh.sample_points_uniformly(samples).points, np.float64)
