@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_tco._open3d import open3d
 from colmap_tco.atomic import atomic_path
-from colmap_tco.errors import InputError, MissingError
+from colmap_tco.errors import InputError
 from colmap_tco.export.dense import Dense, DenseView, open_dense
 from colmap_tco.export.las import spacing
 from colmap_tco.maps import map_intrinsics, read_map
@@ -116,7 +117,7 @@ def mesh(root: Path, config: MeshConfig, progress: Progress) -> Meshed:
         raise InputError(f"{path}: meshes are written as PLY; let the name end in .ply")
     if path.exists() and not config.overwrite:
         raise InputError(f"{path} exists; replace it with --overwrite or name another with -o")
-    o3d = _open3d()
+    o3d = open3d()
     cloud = dense.cloud()
     centre = cloud.points.mean(0)  # Open3D computes in float32 in places
     local = cloud.points - centre
@@ -150,18 +151,6 @@ def mesh(root: Path, config: MeshConfig, progress: Progress) -> Meshed:
                 f"{path}: Open3D could not write it; is there space, and may the folder be written to?"
             )
     return Meshed(path, len(surface.vertices), len(surface.triangles), dropped)
-
-
-def _open3d() -> Any:
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise MissingError(
-            f"Open3D cannot be imported ({error}); it takes a system library that is not there: on Debian "
-            "apt install libusb-1.0-0 libgl1 libgomp1"
-        ) from error
-    open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
-    return open3d
 
 
 def _poisson(o3d: Any, local: Floats, cloud: Cloud, cell: float) -> tuple[TriangleMesh, Floats]:

@@ -15,7 +15,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_tco.evaluation.checks import as_points, open3d
+from colmap_tco._open3d import open3d
+from colmap_tco.evaluation.checks import as_points
 
 logger = logging.getLogger(__name__)
 

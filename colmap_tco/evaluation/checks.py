@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
-
-from colmap_tco.errors import MissingError
 
 Floats = NDArray[np.float64]
 
@@ -43,19 +39,3 @@ def as_poses(world_from_cam: Floats, name: str) -> Floats:
     if wrong.any():
         raise ValueError(f"{name} pose {int(wrong.argmax())} is not a rotation and a translation")
     return out
-
-
-def open3d() -> Any:
-    """The module.
-
-    Raises:
-        MissingError: it cannot be imported.
-    """
-    try:
-        import open3d as o3d
-    except (ImportError, OSError) as error:
-        raise MissingError(
-            f"normals and ICP need Open3D, which cannot be imported ({error}); install it with: "
-            "pip install open3d"
-        ) from error
-    return o3d

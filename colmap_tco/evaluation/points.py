@@ -25,7 +25,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_tco.evaluation.checks import as_points, open3d
+from colmap_tco._open3d import open3d
+from colmap_tco.evaluation.checks import as_points
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

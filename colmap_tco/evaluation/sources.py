@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_tco import _pycolmap
+from colmap_tco._open3d import open3d
 from colmap_tco._pycolmap import Registered
 from colmap_tco.errors import InputError
-from colmap_tco.evaluation.checks import as_poses, open3d
+from colmap_tco.evaluation.checks import as_poses
 from colmap_tco.evaluation.eth3d import Scan
 from colmap_tco.export.dense import Dense, open_dense
 from colmap_tco.workspace import DensePaths, dense_paths, find_models

@@ -20,8 +20,9 @@ from colmap_tco.ply import read_ply, write_ply
 from colmap_tco.progress import Progress
 from colmap_tco.workspace import DensePaths
 from tests.colmap_tco.test_outputs import NORMAL, PIXEL, densify, make_workspace, pattern
+from tests.programs import imported_open3d
 
-o3d = pytest.importorskip("open3d", reason="open3d cannot be imported here")
+o3d = imported_open3d()
 Floats = NDArray[np.float64]
 
 

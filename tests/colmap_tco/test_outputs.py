@@ -38,6 +38,7 @@ from colmap_tco.ply import read_ply, read_vis
 from colmap_tco.resume import Result, fingerprint, open_result
 from colmap_tco.views import View, ViewConfig, make_views
 from colmap_tco.workspace import DensePaths, Workspace, dense_paths, open_workspace, partial_paths
+from tests.programs import imported_open3d
 
 Floats = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parents[2]
@@ -306,7 +307,7 @@ def test_visibility_counts_in_the_order_of_the_written_model(made: Made) -> None
 
 
 def test_open3d_reads_the_cloud(made: Made) -> None:
-    o3d = pytest.importorskip("open3d", reason="open3d cannot be imported here")
+    o3d = imported_open3d()
     cloud = o3d.io.read_point_cloud(str(made.paths.ply))
     assert len(cloud.points) == len(read_ply(made.paths.ply)[0])
     assert cloud.has_normals()

@@ -20,6 +20,7 @@ from colmap_tco.ply import (
     write_ply_blocks,
     write_vis,
 )
+from tests.programs import imported_open3d
 
 
 def random_cloud(count, seed=0):
@@ -75,7 +76,7 @@ def test_double_coordinates_keep_every_bit(tmp_path):
     header, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
     assert b"property double z\nproperty float nx" in header
     assert len(body) == 50 * 39
-    o3d = pytest.importorskip("open3d", reason="open3d cannot be imported here")
+    o3d = imported_open3d()
     assert np.array_equal(np.asarray(o3d.io.read_point_cloud(str(tmp_path / "a.ply")).points), points)
 
 
@@ -232,7 +233,7 @@ def test_join_concatenates_points_and_lists():
 
 
 def test_open3d_reads_points_normals_and_colours(tmp_path):
-    o3d = pytest.importorskip("open3d", reason="open3d cannot be imported here")
+    o3d = imported_open3d()
     points, normals, colors = random_cloud(50)
     write_ply(tmp_path / "c.ply", points, normals, colors)
     theirs = o3d.io.read_point_cloud(str(tmp_path / "c.ply"))

@@ -18,6 +18,7 @@ from colmap_tco.ply import read_ply
 from colmap_tco.progress import Progress
 from colmap_tco.workspace import DensePaths
 from tests.colmap_tco.test_outputs import NORMAL, PIXEL, densify, make_workspace
+from tests.programs import imported_open3d
 
 Floats = NDArray[np.float64]
 
@@ -44,7 +45,7 @@ def colmap(*words: str) -> str:
 
 
 def mesh_vertices(path: Path) -> Floats:
-    o3d = pytest.importorskip("open3d", reason="open3d cannot be imported here")
+    o3d = imported_open3d()
     surface = o3d.io.read_triangle_mesh(str(path))
     assert len(surface.triangles) > 100
     return np.asarray(surface.vertices).copy()
@@ -176,7 +177,7 @@ def test_meshlab_reads_our_meshes(paths: DensePaths, tmp_path: Path, method: str
         import pymeshlab
     except ImportError as error:
         pytest.skip(f"pymeshlab cannot be imported: {error}")
-    pytest.importorskip("open3d", reason="open3d cannot be imported here")
+    imported_open3d()
     from colmap_tco.mesh import MeshConfig, mesh
 
     done = mesh(paths.root, MeshConfig(output_path=tmp_path / "m.ply", method=method), Progress())

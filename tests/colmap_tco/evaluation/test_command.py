@@ -40,8 +40,9 @@ from tests.colmap_tco.test_outputs import (
     names,
     pose,
 )
+from tests.programs import imported_open3d
 
-o3d = pytest.importorskip("open3d", reason="open3d cannot be imported here")
+o3d = imported_open3d()
 Floats = NDArray[np.float64]
 
 METRES = 0.25
