@@ -437,11 +437,11 @@ from colmap_tco.cli import main
 
 predict = densify.predict_chunk
 
-def limited(network, tracks, views, chunk, settings, report):
+def limited(network, tracks, views, chunk, *others):
     import torch
     if len(chunk.views) > 3:
         torch.empty(1 << 60, dtype=torch.uint8)
-    return predict(network, tracks, views, chunk, settings, report)
+    return predict(network, tracks, views, chunk, *others)
 
 densify.predict_chunk = limited
 sys.exit(main(sys.argv[1:]))
