@@ -51,7 +51,7 @@ class PolishConfig:
     """Refinement of each pixel's depth after the network was adapted (``tco/polish.py``)."""
 
     polish_steps: int = knob(
-        60, "steps on the depths themselves, after those on the network; 0, or no steps at all: none"
+        40, "steps on the depths themselves, after those on the network; 0, or no steps at all: none"
     )
     polish_rate: float = knob(
         3e-3, "learning rate of the logarithms of the depths' factors (Adam); lower it if surfaces get rough"
@@ -88,7 +88,7 @@ class TCOConfig:
     """Test-time constrained optimisation (Zhou et al., arXiv 2604.03878)."""
 
     steps: int = knob(
-        10,
+        5,
         "optimisation steps of each chunk on the network; 0 leaves it as it is (plain feed-forward). The "
         "paper takes 40, at a lower rate",
     )

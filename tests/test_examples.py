@@ -179,7 +179,7 @@ def test_custom_prior_puts_on_the_plane_what_is_near_it_in_truth(scene: Scene, t
     assert all("plane" in step for step in outcome.history)
     off = [float(distance(p.depth)[wall].median()) for p in (without, outcome.prediction)]
     assert off[1] < 0.8 * off[0]
-    assert error(outcome.prediction, truth, ~wall) < 1.1 * error(without, truth, ~wall)
+    assert error(outcome.prediction, truth, ~wall) < 1.25 * error(without, truth, ~wall)
 
 
 def test_the_dominant_plane_is_found_among_other_points() -> None:

@@ -162,7 +162,7 @@ def test_a_rough_model_in_another_unit_gets_the_scale_of_its_points(
         depths=write_depths(room, tmp_path / "depths"), output_path=tmp_path / "out", poses=few,
         rough=RoughConfig(rough=tmp_path / "model"),
     )  # fmt: skip
-    with caplog.at_level(logging.INFO):
+    with caplog.at_level(logging.INFO, logger="colmap_tco"):
         found = run(room, config)
     assert found.report["scale"] == pytest.approx(7, rel=0.01)
     assert "triangulated points" in caplog.text

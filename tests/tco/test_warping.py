@@ -162,7 +162,7 @@ def test_pixels_count_by_their_opacity(scene: Wall) -> None:
     """The mean of two halves, weighted by opacity, is the mean over both: nothing couples them."""
     half = torch.zeros_like(opaque(scene))
     half[:, : half.shape[1] // 2] = 1.0
-    warped, image = looked_up(scene, 1 + 0.03 * half, (1,)), scene.views.images[0]
+    warped, image = looked_up(scene, 1 - 0.03 * half, (1,)), scene.views.images[0]
     parts = [float(warped_photometric(warped, image, o, PLAIN)) for o in (half, 1 - half)]
     assert parts[0] > 2 * parts[1]
     sums = [float((o * warped.valid[0]).sum()) for o in (half, 1 - half)]
