@@ -1,6 +1,6 @@
 """Densify the shared real sets and score them against their sensors, beside what else one could run.
 
-``python -m benchmarks.quality --steps 0 40 --baselines interp patchmatch`` prints a Markdown table.
+``python -m benchmarks.quality --steps 0 5 --baselines interp patchmatch`` prints a Markdown table.
 ``--sets`` also takes the rendered scenes of ``benchmarks/rendered.py``, which are scored against their truth.
 Workspaces are copied to ``--work`` first; the shared sets are only read.
 """
@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from benchmarks.rendered import SCENES, made
+from tco.options import TCOConfig
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 SETS = ("kitchen", "office", "livingroom")
@@ -116,7 +117,7 @@ def main() -> None:
     """Command line; other options are handed to densify."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sets", nargs="+", default=list(SETS), choices=[*SETS, *SCENES])
-    parser.add_argument("--steps", nargs="+", type=int, default=[0, 40])
+    parser.add_argument("--steps", nargs="+", type=int, default=[0, TCOConfig().steps])
     parser.add_argument("--baselines", nargs="*", default=["interp"], help="interp, patchmatch")
     parser.add_argument("--work", type=Path, default=Path("runs/quality"))
     args, rest = parser.parse_known_args()

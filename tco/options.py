@@ -109,7 +109,9 @@ class TCOConfig:
         0.0, "weight of dense depths among the priors, after one scale and shift for all that is predicted"
     )
     sparse_weight: float = knob(0.01, "weight of the triangulated points, in inverse depth")
-    consistency_weight: float = knob(1.0, "weight of the agreement with the depths of the other views")
+    consistency_weight: float = knob(
+        1.0, "weight of the agreement with the depths of the other views, in the steps on the network"
+    )
     camera_weight: float = knob(
         3e-4,
         "weight of the pose and focal priors, each in units of its own uncertainty. With b the colour error "

@@ -49,11 +49,10 @@ class ExtraTerm:
 
 COMPATIBILITY = frozenset({"photometric", "geometric", "warped", "consistency"})
 """Terms that compare a view with others."""
-OWN = COMPATIBILITY | {"smoothness", "sparse", "depth", "cameras", "loss", "hidden", "held_out"}
-"""Names that the history has already."""
-
 HELD = {"rotation": penalties.rotation, "translation": penalties.translation, "focal": penalties.focal}
 """Terms that hold the cameras that a network predicts."""
+OWN = COMPATIBILITY | HELD.keys() | {"smoothness", "sparse", "depth", "cameras", "loss", "hidden", "held_out"}
+"""Names that the history has already."""
 
 
 class Terms:

@@ -7,6 +7,7 @@ millimetres, 65535) ends in its reader.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -110,6 +111,39 @@ class Dataset(Protocol):
     def read(self, scene: str, frames: Sequence[int]) -> Scene:
         """The frames at these positions, counted from 0 in the order of the dataset."""
         ...
+
+
+class InFolder(ABC):
+    """A dataset whose root holds a folder for each scene; what its readers share.
+
+    Attributes:
+        name: as ``--dataset`` spells it.
+        title: as its authors spell it, for messages.
+        root: the folder.
+    """
+
+    name: str
+    title: str
+
+    def __init__(self, root: Path) -> None:
+        """Where the scenes' folders are.
+
+        Raises:
+            InputError: the folder is not there.
+        """
+        self.root = existing(Path(root), f"the folder of {self.title}", "name it with --root")
+
+    @abstractmethod
+    def pictures(self, scene: str) -> list[Path]:
+        """The colour pictures of a scene, in order.
+
+        Raises:
+            InputError: they are not there.
+        """
+
+    def count(self, scene: str) -> int:
+        """Number of pictures of a scene."""
+        return len(self.pictures(scene))
 
 
 def rays(xy: Floats, K: Floats) -> Floats:

@@ -24,6 +24,7 @@ from colmap_tco.datasets.base import (
     Depth,
     Floats,
     Frame,
+    InFolder,
     Scene,
     chosen,
     existing,
@@ -42,18 +43,11 @@ MILLIMETRE = 1e-3
 REMEDY = "unpack the DTU archive that docs/data_preprocess.md of HengyiWang/spann3r links into --root"
 
 
-class DTU:
+class DTU(InFolder):
     """The scans of MVSNet's test set that are there."""
 
     name = "dtu"
-
-    def __init__(self, root: Path) -> None:
-        """Where the scans' folders are.
-
-        Raises:
-            InputError: the folder is not there.
-        """
-        self.root = existing(Path(root), "the folder of DTU", "name it with --root")
+    title = "DTU"
 
     def scenes(self) -> list[str]:
         """``scan1`` and so on.
@@ -66,11 +60,8 @@ class DTU:
             raise InputError(f"{self.root}: no scan of MVSNet's test set in it, such as scan1; {REMEDY}")
         return found
 
-    def count(self, scene: str) -> int:
-        """Number of pictures."""
-        return len(self._pictures(scene))
-
-    def _pictures(self, scene: str) -> list[Path]:
+    def pictures(self, scene: str) -> list[Path]:
+        """The colour pictures of a scene, in order."""
         return numbered(existing(self.root / scene / "images", "the pictures", REMEDY), "", ".jpg")
 
     def read(self, scene: str, frames: Sequence[int]) -> Scene:
@@ -79,7 +70,7 @@ class DTU:
         Raises:
             InputError: a file is missing or damaged.
         """
-        paths = chosen(self._pictures(scene), frames, scene)
+        paths = chosen(self.pictures(scene), frames, scene)
         number = int(scene.removeprefix("scan"))
         cloud = self.root / "Points" / "stl" / f"stl{number:03d}_total.ply"
         return Scene(scene, tuple(map(_frame, paths)), cloud if cloud.exists() else None)

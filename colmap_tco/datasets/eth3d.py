@@ -34,6 +34,7 @@ from colmap_tco.datasets.base import (
     Depth,
     Floats,
     Frame,
+    InFolder,
     Scene,
     chosen,
     existing,
@@ -69,18 +70,11 @@ class Calibrated:
     cam_from_world: Floats
 
 
-class ETH3D:
+class ETH3D(InFolder):
     """The scenes of the multi-view training set that are there."""
 
     name = "eth3d"
-
-    def __init__(self, root: Path) -> None:
-        """Where the scenes' folders are.
-
-        Raises:
-            InputError: the folder is not there.
-        """
-        self.root = existing(Path(root), "the folder of ETH3D", "name it with --root")
+    title = "ETH3D"
 
     def scenes(self) -> list[str]:
         """The folders that hold pictures.
@@ -102,16 +96,13 @@ class ETH3D:
                 return self.root / scene / "images" / name
         return None
 
-    def _pictures(self, scene: str) -> list[Path]:
+    def pictures(self, scene: str) -> list[Path]:
+        """The colour pictures of a scene, in order."""
         folder = self._folder(scene)
         if folder is None:
             missing = self.root / scene / "images" / _UNDISTORTED
             raise InputError(f"{missing} is missing: the undistorted pictures; {REMEDY}")
         return sorted(path for path in folder.iterdir() if path.suffix.upper() == ".JPG")
-
-    def count(self, scene: str) -> int:
-        """Number of pictures."""
-        return len(self._pictures(scene))
 
     def read(self, scene: str, frames: Sequence[int]) -> Scene:
         """Frames of a scene in the order of their names, with the project of its scans if it is there.
@@ -119,7 +110,7 @@ class ETH3D:
         Raises:
             InputError: a file is missing or damaged.
         """
-        paths, root = chosen(self._pictures(scene), frames, scene), self.root / scene
+        paths, root = chosen(self.pictures(scene), frames, scene), self.root / scene
         scans = root / "dslr_scan_eval" / "scan_alignment.mlp"
         if paths and paths[0].parent.name == _PREPARED:
             found = tuple(_prepared(root, path) for path in paths)

@@ -26,6 +26,7 @@ from colmap_tco.datasets.base import (
     Depth,
     Floats,
     Frame,
+    InFolder,
     Scene,
     chosen,
     existing,
@@ -51,18 +52,11 @@ REMEDY = (
 )
 
 
-class NRGBD:
+class NRGBD(InFolder):
     """The nine rooms."""
 
     name = "nrgbd"
-
-    def __init__(self, root: Path) -> None:
-        """Where the scenes' folders are.
-
-        Raises:
-            InputError: the folder is not there.
-        """
-        self.root = existing(Path(root), "the folder of NRGBD", "name it with --root")
+    title = "NRGBD"
 
     def scenes(self) -> list[str]:
         """The folders that hold pictures.
@@ -75,11 +69,8 @@ class NRGBD:
             raise InputError(f"{self.root}: no folder in it has images/; {REMEDY}")
         return found
 
-    def count(self, scene: str) -> int:
-        """Number of pictures."""
-        return len(self._pictures(scene))
-
-    def _pictures(self, scene: str) -> list[Path]:
+    def pictures(self, scene: str) -> list[Path]:
+        """The colour pictures of a scene, in order."""
         return numbered(existing(self.root / scene / "images", "the pictures", REMEDY), "img", ".png")
 
     def read(self, scene: str, frames: Sequence[int]) -> Scene:
@@ -89,7 +80,7 @@ class NRGBD:
             InputError: a file is missing or damaged, poses and pictures are not as many, or a frame was not
                 tracked.
         """
-        pictures, folder = self._pictures(scene), self.root / scene
+        pictures, folder = self.pictures(scene), self.root / scene
         file = folder / "poses.txt"
         poses = read_numbers(file, "the poses, lines of 4 numbers", REMEDY)
         if poses.shape != (4 * len(pictures), 4):

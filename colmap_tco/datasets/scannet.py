@@ -29,6 +29,7 @@ import numpy as np
 from colmap_tco.datasets.base import (
     Floats,
     Frame,
+    InFolder,
     Scene,
     chosen,
     existing,
@@ -47,18 +48,11 @@ COUNT, EVERY = 90, 3
 REMEDY = "export the scene's .sens with ScanNet's SensReader, see docs/bench.md"
 
 
-class ScanNet:
+class ScanNet(InFolder):
     """The scenes that are there."""
 
     name = "scannet"
-
-    def __init__(self, root: Path) -> None:
-        """Where the scenes' folders are.
-
-        Raises:
-            InputError: the folder is not there.
-        """
-        self.root = existing(Path(root), "the folder of ScanNet", "name it with --root")
+    title = "ScanNet"
 
     def scenes(self) -> list[str]:
         """``scene0707_00`` and so on: all folders that hold frames.
@@ -76,16 +70,13 @@ class ScanNet:
     def _has(self, scene: str, folder: str) -> bool:
         return (self.root / scene / folder).is_dir()
 
-    def _pictures(self, scene: str) -> list[Path]:
+    def pictures(self, scene: str) -> list[Path]:
+        """The colour pictures of a scene, in order, at most 90."""
         root = self.root / scene
         if self._has(scene, "color_90"):
             return numbered(root / "color_90", "frame_", ".jpg")
         pictures = numbered(existing(root / "color", "the pictures", REMEDY), "", ".jpg")
         return pictures[: COUNT * EVERY : EVERY]
-
-    def count(self, scene: str) -> int:
-        """Number of frames, at most 90."""
-        return len(self._pictures(scene))
 
     def read(self, scene: str, frames: Sequence[int]) -> Scene:
         """Frames of a scene, with its mesh if it is there.
@@ -93,7 +84,7 @@ class ScanNet:
         Raises:
             InputError: a file is missing or damaged, or a frame was not tracked.
         """
-        root, pictures = self.root / scene, self._pictures(scene)
+        root, pictures = self.root / scene, self.pictures(scene)
         K = _intrinsics(root, "color")
         depth_K = _intrinsics(root, "depth")
         paths = chosen(pictures, frames, scene)

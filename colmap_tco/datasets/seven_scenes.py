@@ -31,6 +31,7 @@ from colmap_tco.datasets.base import (
     Depth,
     Floats,
     Frame,
+    InFolder,
     Scene,
     chosen,
     existing,
@@ -66,10 +67,11 @@ COLOUR_FROM_DEPTH: Floats = np.array(
 REMEDY = "unpack the scene's archive and the archives of its sequences in it, see docs/bench.md"
 
 
-class SevenScenes:
+class SevenScenes(InFolder):
     """The sequences of the test split."""
 
     name = "7scenes"
+    title = "7-Scenes"
 
     def __init__(self, root: Path, as_published: bool = False) -> None:
         """Where the scenes' folders are, and whether focal length and poses are those of the evaluations.
@@ -77,7 +79,7 @@ class SevenScenes:
         Raises:
             InputError: the folder is not there.
         """
-        self.root = existing(Path(root), "the folder of 7-Scenes", "name it with --root")
+        super().__init__(root)
         self.as_published = as_published
 
     def scenes(self) -> list[str]:
@@ -98,11 +100,8 @@ class SevenScenes:
             raise InputError(f"{self.root}: no scene in it; {REMEDY}")
         return found
 
-    def count(self, scene: str) -> int:
-        """Number of colour pictures of a sequence."""
-        return len(self._pictures(scene))
-
-    def _pictures(self, scene: str) -> list[Path]:
+    def pictures(self, scene: str) -> list[Path]:
+        """The colour pictures of a scene, in order."""
         folder = existing(self.root / scene, "a sequence", REMEDY)
         return numbered(folder, "frame-", ".color.png")
 
@@ -112,7 +111,7 @@ class SevenScenes:
         Raises:
             InputError: a file is missing or damaged, or a picture is not of 640×480 pixels.
         """
-        paths = chosen(self._pictures(scene), frames, scene)
+        paths = chosen(self.pictures(scene), frames, scene)
         return Scene(scene, tuple(self._frame(path) for path in paths))
 
     def _frame(self, picture: Path) -> Frame:

@@ -186,7 +186,7 @@ def test_an_extra_term_may_be_silent_or_off_and_gives_the_cameras(scene: Wall) -
 
 
 def test_names_and_weights_of_extra_terms_are_checked(scene: Wall) -> None:
-    for name, weight in (("photometric", 1.0), ("loss", 1.0), ("mine", -1.0)):
+    for name, weight in (("photometric", 1.0), ("loss", 1.0), ("rotation", 1.0), ("mine", -1.0)):
         with pytest.raises(ValueError, match="an extra term needs"):
             ExtraTerm(name, weight, lambda *_: None)
     with pytest.raises(ValueError, match="extra terms of one name: mine, mine"):

@@ -125,7 +125,7 @@ def test_scannet_takes_every_third_of_the_first_270(tmp_path: Path) -> None:
         (color / f"{i}.jpg").write_bytes(b"")
     dataset = open_dataset("scannet", tmp_path)
     assert dataset.count("scene0707_00") == 90
-    stem = [path.stem for path in dataset._pictures("scene0707_00")]  # type: ignore[attr-defined]
+    stem = [path.stem for path in dataset.pictures("scene0707_00")]  # type: ignore[attr-defined]
     assert stem[:3] == ["0", "3", "6"] and stem[-1] == "267"
 
 
