@@ -49,7 +49,6 @@ class TrainConfig:
         average: decay of the moving average of the weights.
         minutes: if not 0, the schedule runs by the clock and ends after so long, whatever ``steps`` says;
             where a machine is lent for a time. Such a training does not repeat to the last bit.
-        newest: share of the samples that come from the last folder, where there are several.
         held_out: samples with the lowest numbers, kept for validation.
     """
 
@@ -61,7 +60,6 @@ class TrainConfig:
     refined: int = 3
     average: float = 0.995
     minutes: float = 0.0
-    newest: float = 0.6
     held_out: int = 16
     seed: int = 0
 
@@ -236,16 +234,15 @@ class Trainer:
     def draw(self, step: int) -> Drawn:
         """A sample for a step of this process, and the generator that drew it.
 
-        The largest size is drawn from the last folder alone.
+        The largest size is drawn from the last folder alone, the others evenly from all samples.
         """
         c = self.config
         rng = np.random.default_rng((c.seed, step, self.rank))
         progress = self.progress(step)
         reached = [s for s in c.sizes if s[0] <= progress]
         _, h, w = reached[-1 if rng.random() < c.share else max(-2, -len(reached))]
-        newest = (h, w) == tuple(c.sizes[-1][1:]) or rng.random() < c.newest
-        folder = self.files[-1] if newest else self.files[rng.integers(len(self.files))]
-        files = folder[c.held_out :]
+        largest = (h, w) == tuple(c.sizes[-1][1:])
+        files = [f for folder in self.files[-1 if largest else 0 :] for f in folder[c.held_out :]]
         while True:
             sample = load(files[rng.integers(len(files))], int(rng.integers(2**31)), (h, w))
             if sample is not None:
