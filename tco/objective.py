@@ -15,6 +15,7 @@ from torch import Tensor
 
 from tco.config import knob
 from tco.render import Rendered, render
+from tco.ssim import ssim
 from tco.surfels import Surfels
 from tco.types import Cameras
 
@@ -125,7 +126,7 @@ def color_difference(rendered: Rendered, images: Tensor, weight: Tensor, config:
 
     Args:
         rendered: T renderings.
-        images: (T, 3, H, W).
+        images: (T, 3, H, W), or (1, 3, H, W) where all are compared with the same.
         weight: (T, H, W), not all zero.
         config: exposure, structure and the treatment of alpha.
     """
@@ -135,9 +136,8 @@ def color_difference(rendered: Rendered, images: Tensor, weight: Tensor, config:
         color = color / rendered.alpha.clamp_min(1 / 255).unsqueeze(-1)
     image = images.permute(0, 2, 3, 1)
     if config.exposure:
-        gain, bias = match_exposure(color, image, weight)
-        if not config.exposure_gradient:
-            gain, bias = gain.detach(), bias.detach()
+        shown = color if config.exposure_gradient else color.detach()
+        gain, bias = match_exposure(shown, image, weight)
         color = gain * color + bias
     error = (color - image).abs().mean(-1)
     if config.structure > 0:
@@ -182,8 +182,6 @@ def _dissimilarity(color: Tensor, image: Tensor, weight: Tensor, config: Objecti
 
     Pixels without weight take the target's colour, so that they agree in the windows of the others.
     """
-    from kornia.metrics import ssim
-
     filled = torch.where((weight > 0).unsqueeze(-1), color, image).permute(0, 3, 1, 2)
     similarity = ssim(filled, image.permute(0, 3, 1, 2), config.ssim_window)
     return ((1 - similarity) / 2).clamp(0, 1).mean(1)

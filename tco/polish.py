@@ -101,21 +101,28 @@ def polish(
         report: called after every step with its number, from ``config.steps`` on, and its terms.
         watched: points of each view that nothing is fitted to; see :func:`tco.optimize.optimize`.
     """
-    c, every = config.polish, range(len(prediction.depth))
+    c, views = config.polish, range(len(prediction.depth))
     field = DepthField(prediction.depth, c.polish_levels)
     optimiser = torch.optim.Adam(field.parameters(), c.polish_rate)
     sources = Sources("epoch", terms.overlap, generator)
     weights = _weights(terms, config)
     edges = picture_edges(terms.views.images)
+    now = replace(prediction, depth=prediction.depth.clone(), stages=())
 
-    def gradients(source: int, now: Prediction) -> dict[str, Tensor]:
+    def draw() -> list[tuple[int, list[int]]]:
+        """The sources of a step, and what each is compared with."""
+        chosen = sources.draw(c.polish_sources)
+        if not weights.keys() & COMPATIBILITY:
+            return [(source, []) for source in chosen]
+        return [(s, draw_targets(terms.overlap, s, config.targets, generator)) for s in chosen]
+
+    def gradients(source: int, targets: Sequence[int]) -> dict[str, Tensor]:
         """Terms of one source, whose gradients are added to those of the field."""
-        overlapping = draw_targets(terms.overlap, source, config.targets, generator)
-        targets = overlapping if weights.keys() & COMPATIBILITY else []
-        mine = _refined(prediction, field, [source])
+        change = field([source])
+        mine = _refined(prediction, change, [source])
         part = terms.of_source(source, targets, mine, now, cameras, weights)
         if "smoothness" in weights:
-            part["smoothness"] = roughness(field([source])[0], [edge[source] for edge in edges])
+            part["smoothness"] = roughness(change[0], [edge[source] for edge in edges])
         found = {name: value.detach() for name, value in part.items()}
         if part:
             # One source after the other, so that only one rendering is in memory.
@@ -132,9 +139,11 @@ def polish(
         for group in optimiser.param_groups:
             group["lr"] = c.polish_rate * (1 - (1 - LAST_RATE) * step / c.polish_steps)
         optimiser.zero_grad(set_to_none=True)
+        pairs = draw()
+        seen = sorted({target for _, targets in pairs for target in targets})
         with torch.no_grad():
-            now = _refined(prediction, field, every)
-        parts = means([gradients(source, now) for source in sources.draw(c.polish_sources)])
+            now.depth[seen] = _refined(prediction, field(seen), seen).depth
+        parts = means([gradients(*pair) for pair in pairs])
         figures = {"loss": 0.0} | {name: float(value) for name, value in parts.items()}
         if _finite(field, figures["loss"]):
             optimiser.step()
@@ -145,7 +154,7 @@ def polish(
         if report is not None:
             report(config.steps + step, figures)
     with torch.no_grad():
-        return Polished(_refined(prediction, field, every), history, skipped)
+        return Polished(_refined(prediction, field(views), views), history, skipped)
 
 
 def _weights(terms: Terms, config: TCOConfig) -> dict[str, float]:
@@ -179,12 +188,12 @@ def roughness(field: Tensor, edges: Sequence[Tensor]) -> Tensor:
     return (across * field.diff(dim=1).abs()).mean() + (down * field.diff(dim=0).abs()).mean()
 
 
-def _refined(prediction: Prediction, field: DepthField, views: Sequence[int]) -> Prediction:
-    """The prediction of some views with its depths times their factors."""
+def _refined(prediction: Prediction, change: Tensor, views: Sequence[int]) -> Prediction:
+    """The prediction of some views with its depths times exp(``change``)."""
     chosen = list(views)
     return replace(
         prediction,
-        depth=prediction.depth[chosen] * torch.exp(field(chosen)),
+        depth=prediction.depth[chosen] * torch.exp(change),
         confidence=prediction.confidence[chosen],
         views=tuple(chosen),
         stages=(),

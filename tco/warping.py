@@ -119,4 +119,4 @@ def warped_photometric(
     if not bool((weight > 0).any()):
         raise NothingVisibleError("no valid pixel of the target views shows what the source view sees")
     there = Rendered(warped.color, warped.depth, torch.ones_like(warped.depth))
-    return color_difference(there, image.expand(len(weight), -1, -1, -1), weight, config)
+    return color_difference(there, image.unsqueeze(0), weight, config)
