@@ -101,51 +101,17 @@ def polish(
         report: called after every step with its number, from ``config.steps`` on, and its terms.
         watched: points of each view that nothing is fitted to; see :func:`tco.optimize.optimize`.
     """
-    c, views = config.polish, range(len(prediction.depth))
-    field = DepthField(prediction.depth, c.polish_levels)
-    optimiser = torch.optim.Adam(field.parameters(), c.polish_rate)
-    sources = Sources("epoch", terms.overlap, generator)
-    weights = _weights(terms, config)
-    edges = picture_edges(terms.views.images)
-    now = replace(prediction, depth=prediction.depth.clone(), stages=())
-
-    def draw() -> list[tuple[int, list[int]]]:
-        """The sources of a step, and what each is compared with."""
-        chosen = sources.draw(c.polish_sources)
-        if not weights.keys() & COMPATIBILITY:
-            return [(source, []) for source in chosen]
-        return [(s, draw_targets(terms.overlap, s, config.targets, generator)) for s in chosen]
-
-    def gradients(source: int, targets: Sequence[int]) -> dict[str, Tensor]:
-        """Terms of one source, whose gradients are added to those of the field."""
-        change = field([source])
-        mine = _refined(prediction, change, [source])
-        part = terms.of_source(source, targets, mine, now, cameras, weights)
-        if "smoothness" in weights:
-            part["smoothness"] = roughness(change[0], [edge[source] for edge in edges])
-        found = {name: value.detach() for name, value in part.items()}
-        if part:
-            # One source after the other, so that only one rendering is in memory.
-            loss = torch.stack([weights[name] * value for name, value in part.items()]).sum()
-            (loss / c.polish_sources).backward()
-            found["loss"] = loss.detach()
-        if watched and len(watched[source]):
-            found["held_out"] = errors_at(mine.depth[0].detach(), watched[source]).abs().median()
-        return found
-
+    c = config.polish
+    run = _Polishing(prediction, cameras, terms, config, generator, watched)
+    optimiser = torch.optim.Adam(run.field.parameters(), c.polish_rate)
     history: list[dict[str, float]] = []
     skipped: list[int] = []
     for step in range(c.polish_steps):
         for group in optimiser.param_groups:
             group["lr"] = c.polish_rate * (1 - (1 - LAST_RATE) * step / c.polish_steps)
         optimiser.zero_grad(set_to_none=True)
-        pairs = draw()
-        seen = sorted({target for _, targets in pairs for target in targets})
-        with torch.no_grad():
-            now.depth[seen] = _refined(prediction, field(seen), seen).depth
-        parts = means([gradients(*pair) for pair in pairs])
-        figures = {"loss": 0.0} | {name: float(value) for name, value in parts.items()}
-        if _finite(field, figures["loss"]):
+        figures = {"loss": 0.0} | {name: float(value) for name, value in run.gradients().items()}
+        if _finite(run.field, figures["loss"]):
             optimiser.step()
         else:
             logger.warning("step %d on the depths: the loss or its gradient is not finite; skipped", step)
@@ -154,7 +120,65 @@ def polish(
         if report is not None:
             report(config.steps + step, figures)
     with torch.no_grad():
-        return Polished(_refined(prediction, field(views), views), history, skipped)
+        return Polished(run.refined(range(len(prediction.depth))), history, skipped)
+
+
+class _Polishing:
+    """The objective of one chunk's depths; arguments as in :func:`polish`."""
+
+    def __init__(
+        self, prediction: Prediction, cameras: Cameras, terms: Terms, config: TCOConfig,
+        generator: torch.Generator, watched: Sequence[SparseDepth],
+    ) -> None:  # fmt: skip
+        self.prediction, self.cameras, self.terms, self.config = prediction, cameras, terms, config
+        self.generator, self.watched = generator, watched
+        self.field = DepthField(prediction.depth, config.polish.polish_levels)
+        self.sources = Sources("epoch", terms.overlap, generator)
+        self.weights = _weights(terms, config)
+        self.edges = picture_edges(terms.views.images)
+        self.now = replace(prediction, depth=prediction.depth.clone(), stages=())
+
+    def gradients(self) -> dict[str, Tensor]:
+        """Means of the terms over the sources of a step, whose gradients are added to the field's."""
+        pairs = [(s, self.targets(s)) for s in self.sources.draw(self.config.polish.polish_sources)]
+        seen = sorted({target for _, targets in pairs for target in targets})
+        with torch.no_grad():
+            self.now.depth[seen] = self.refined(seen).depth
+        return means([self.of_source(*pair) for pair in pairs])
+
+    def targets(self, source: int) -> list[int]:
+        """Views that a source is compared with."""
+        if not self.weights.keys() & COMPATIBILITY:
+            return []
+        return draw_targets(self.terms.overlap, source, self.config.targets, self.generator)
+
+    def of_source(self, source: int, targets: Sequence[int]) -> dict[str, Tensor]:
+        """Terms of one source; one after the other, so that only one comparison is in memory."""
+        change = self.field([source])
+        mine = self.refined([source], change)
+        part = self.terms.of_source(source, targets, mine, self.now, self.cameras, self.weights)
+        if "smoothness" in self.weights:
+            part["smoothness"] = roughness(change[0], [edge[source] for edge in self.edges])
+        found = {name: value.detach() for name, value in part.items()}
+        if part:
+            loss = torch.stack([self.weights[name] * value for name, value in part.items()]).sum()
+            (loss / self.config.polish.polish_sources).backward()
+            found["loss"] = loss.detach()
+        if self.watched and len(self.watched[source]):
+            found["held_out"] = errors_at(mine.depth[0].detach(), self.watched[source]).abs().median()
+        return found
+
+    def refined(self, views: Sequence[int], change: Tensor | None = None) -> Prediction:
+        """The prediction of some views with its depths times exp(``change``), by default the field's."""
+        chosen = list(views)
+        factor = torch.exp(self.field(chosen) if change is None else change)
+        return replace(
+            self.prediction,
+            depth=self.prediction.depth[chosen] * factor,
+            confidence=self.prediction.confidence[chosen],
+            views=tuple(chosen),
+            stages=(),
+        )
 
 
 def _weights(terms: Terms, config: TCOConfig) -> dict[str, float]:
@@ -186,18 +210,6 @@ def roughness(field: Tensor, edges: Sequence[Tensor]) -> Tensor:
     """
     across, down = edges
     return (across * field.diff(dim=1).abs()).mean() + (down * field.diff(dim=0).abs()).mean()
-
-
-def _refined(prediction: Prediction, change: Tensor, views: Sequence[int]) -> Prediction:
-    """The prediction of some views with its depths times exp(``change``)."""
-    chosen = list(views)
-    return replace(
-        prediction,
-        depth=prediction.depth[chosen] * torch.exp(change),
-        confidence=prediction.confidence[chosen],
-        views=tuple(chosen),
-        stages=(),
-    )
 
 
 def _finite(field: DepthField, loss: float) -> bool:
