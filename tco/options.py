@@ -51,10 +51,10 @@ class PolishConfig:
     """Refinement of each pixel's depth after the network was adapted (``tco/polish.py``)."""
 
     polish_steps: int = knob(
-        40, "steps on the depths themselves, after those on the network; 0, or no steps at all: none"
+        60, "steps on the depths themselves, after those on the network; 0, or no steps at all: none"
     )
     polish_rate: float = knob(
-        3e-3, "learning rate of the logarithms of the depths' factors (Adam); lower it if surfaces get rough"
+        7e-3, "learning rate of the logarithms of the depths' factors (Adam); lower it if surfaces get rough"
     )
     polish_sources: int = knob(2, "views whose depths each of these steps looks at")
     polish_smoothness: float = knob(

@@ -31,10 +31,16 @@ logger = logging.getLogger(__name__)
 
 LAST_RATE = 0.2
 """The learning rate falls linearly to this share of the first."""
+BETAS = (0.5, 0.99)
+"""Decay of Adam's means. Each view is a source few times, so that a longer memory would never be filled."""
 
 
 class DepthField(nn.Module):
-    """Logarithms of factors of the depths of V views: sums of grids, each a level of coarser pixels."""
+    """Logarithms of factors of the depths of V views: sums of grids, each a level of coarser pixels.
+
+    Each view's grids are parameters of their own, so that Adam leaves alone the views that a step does not
+    look at: their gradient is none, not zero, and what it remembers of them neither moves them on nor fades.
+    """
 
     def __init__(self, depth: Tensor, levels: Sequence[int]) -> None:
         """Take shape, dtype and device from the depth (V, H, W); a grid for each side of its cells in pixels.
@@ -48,16 +54,15 @@ class DepthField(nn.Module):
         views, *size = depth.shape
         self.size, self.levels = (size[0], size[1]), tuple(levels)
         self.grids = nn.ParameterList(
-            torch.zeros(views, 1, *(-(-s // level) for s in size), dtype=depth.dtype, device=depth.device)
-            for level in levels
+            depth.new_zeros(1, *(-(-s // level) for s in size)) for _ in range(views) for level in levels
         )
 
     def forward(self, views: Sequence[int]) -> Tensor:
         """δ (len(views), H, W)."""
         h, w = self.size
         total = None
-        for level, grid in zip(self.levels, self.grids, strict=True):
-            part = grid[list(views)]
+        for i, level in enumerate(self.levels):
+            part = torch.stack([self.grids[view * len(self.levels) + i] for view in views])
             if level > 1:
                 whole = (part.shape[-2] * level, part.shape[-1] * level)
                 part = F.interpolate(part, whole, mode="bilinear", align_corners=False)[..., :h, :w]
@@ -103,7 +108,7 @@ def polish(
     """
     c = config.polish
     run = _Polishing(prediction, cameras, terms, config, generator, watched)
-    optimiser = torch.optim.Adam(run.field.parameters(), c.polish_rate)
+    optimiser = torch.optim.Adam(run.field.parameters(), c.polish_rate, BETAS)
     history: list[dict[str, float]] = []
     skipped: list[int] = []
     for step in range(c.polish_steps):
@@ -142,8 +147,9 @@ class _Polishing:
         """Means of the terms over the sources of a step, whose gradients are added to the field's."""
         pairs = [(s, self.targets(s)) for s in self.sources.draw(self.config.polish.polish_sources)]
         seen = sorted({target for _, targets in pairs for target in targets})
-        with torch.no_grad():
-            self.now.depth[seen] = self.refined(seen).depth
+        if seen:
+            with torch.no_grad():
+                self.now.depth[seen] = self.refined(seen).depth
         return means([self.of_source(*pair) for pair in pairs])
 
     def targets(self, source: int) -> list[int]:

@@ -59,19 +59,32 @@ def off(prediction: Prediction, scene: Wall) -> float:
 def test_the_field_is_nothing_at_first_and_a_sum_of_its_levels() -> None:
     depth = torch.ones(3, 21, 30)
     field = DepthField(depth, (1, 4, 16))
-    assert [tuple(g.shape) for g in field.grids] == [(3, 1, 21, 30), (3, 1, 6, 8), (3, 1, 2, 2)]
+    assert [tuple(g.shape) for g in field.grids] == 3 * [(1, 21, 30), (1, 6, 8), (1, 2, 2)]
     assert torch.equal(field([0, 2]), torch.zeros(2, 21, 30))
     with torch.no_grad():
-        for grid, value in zip(field.grids, (1.0, 10.0, 100.0), strict=True):
-            grid[1] = value
+        for grid, value in zip(list(field.grids)[3:6], (1.0, 10.0, 100.0), strict=True):
+            grid.fill_(value)
     torch.testing.assert_close(field([1, 0]), torch.stack([torch.full((21, 30), 111.0), torch.zeros(21, 30)]))
+
+
+def test_only_the_views_that_were_looked_at_move() -> None:
+    """Adam's memory of a view neither moves it on nor fades while other views are looked at."""
+    field = DepthField(torch.ones(2, 8, 8), (2, 4))
+    optimiser = torch.optim.Adam(field.parameters(), 0.1)
+    for view in (0, 1, 1):
+        before = field([1 - view]).detach().clone()
+        optimiser.zero_grad(set_to_none=True)
+        field([view]).sum().backward()
+        optimiser.step()
+        torch.testing.assert_close(field([1 - view]), before, rtol=0, atol=0)
+        assert float(field([view]).detach().abs().min()) > 0
 
 
 def test_a_level_is_linear_between_the_middles_of_its_cells() -> None:
     """A ramp over the cells is that ramp over the pixels: their centres are at +0.5, those of cells at +2."""
     field = DepthField(torch.ones(1, 16, 24), (4,))
     with torch.no_grad():
-        field.grids[0][0, 0] = 4 * torch.arange(6.0) + 2
+        field.grids[0][0] = 4 * torch.arange(6.0) + 2
     x = torch.arange(24.0) + 0.5
     torch.testing.assert_close(field([0])[0, :, 2:-2], x[2:-2].expand(16, 20))
 

@@ -199,7 +199,7 @@ def test_poses_from_depths_on_scannet(config: BenchConfig, tmp_path: Path) -> No
 def test_the_embedded_network_reconstructs_a_room_from_prior_cameras_alone(
     room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its points are triangulated from the pictures, and it comes closer than a flat guess would."""
+    """Its points are triangulated from the pictures; half of what it finds is within 2 % of the room's depth."""
     from colmap_tco.datasets import CHOICES, Choice
 
     monkeypatch.setitem(CHOICES, "nrgbd", {"sparse": Choice(1)})
@@ -216,8 +216,9 @@ def test_the_embedded_network_reconstructs_a_room_from_prior_cameras_alone(
     bench(config, Progress())
     folder = tmp_path / "out" / "nrgbd-sparse-sweep"
     lines = {line["row"]: line for line in csv.DictReader((folder / "table.csv").read_text().splitlines())}
+    depth = float(np.median(room.sample.depth))
     for line in lines.values():
-        assert float(line["acc_med"]) < 0.1 and float(line["comp_med"]) < 0.1
-        assert float(line["nc_mean"]) > 0.55
+        assert float(line["acc_med"]) < 0.02 * depth and float(line["comp_med"]) < 0.02 * depth
+        assert float(line["nc_med"]) > 0.8
     with pytest.raises(InputError, match="sweep takes poses and intrinsics as input"):
         bench(replace(config, rows=("base",)), Progress())
