@@ -88,7 +88,7 @@ def main() -> None:
         "|---" * (len(sets) + 1) + "|",
     ]
     for name, config in variants(
-        network.decoder(), TCOConfig(steps=args.steps, polish=PolishConfig(polish_steps=0))
+        network.decoder(), TCOConfig(steps=args.steps, polish=PolishConfig(polish_looks=0))
     ):
         if wanted and not any(word in name for word in wanted):
             continue

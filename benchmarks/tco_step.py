@@ -75,7 +75,7 @@ def measure(name: str, args: argparse.Namespace, reference: bool) -> Curve:
     torch.set_num_threads(args.threads)
     real, network = load(name, args.size, args.views), load_sweep(args.weights or EMBEDDED)
     # Fixed cameras, and the network alone: the loss that is compared is that of its depths.
-    config = TCOConfig(steps=args.steps, camera_rate=0, polish=PolishConfig(polish_steps=0))
+    config = TCOConfig(steps=args.steps, camera_rate=0, polish=PolishConfig(polish_looks=0))
     backbone: Backbone = network
     if reference:
         config, backbone = config.reference_schedule(), Uncached(network)

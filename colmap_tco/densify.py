@@ -280,7 +280,7 @@ def _predict(
     """
     chosen, budget, existing = run
     todo = [c for c in plan.chunks if not all(result.is_done(views[i].name) for i in c.owned)]
-    progress.stage("optimisation", sum(config.tco.all_steps + len(c.owned) for c in todo))
+    progress.stage("optimisation", sum(config.tco.all_steps(len(c.views)) + len(c.owned) for c in todo))
     if not todo:
         return {}
     backbone, failed = load(chosen), {}

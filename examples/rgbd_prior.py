@@ -74,7 +74,7 @@ def adapt(scene: Scene, priors: Priors, steps: int) -> Outcome:
     config = TCOConfig(steps=steps)
     if priors.depth is not None:
         # A sensor knows more of each pixel than colours do: more and larger steps on the depths themselves.
-        polish = PolishConfig(polish_steps=60, polish_rate=1.5e-3)
+        polish = PolishConfig(polish_looks=20, polish_rate=4e-3)
         config = TCOConfig(steps=steps, depth_weight=0.1, polish=polish)
     return optimize(load_sweep(), scene.views, priors, config)
 

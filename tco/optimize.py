@@ -332,7 +332,7 @@ class _Run:
 
     def polished(self, outcome: Outcome, report: Report | None) -> Outcome:
         """The outcome with its depths refined, if that is wanted; where cameras are sought it is not."""
-        if self.config.polish.polish_steps == 0 or self.priors.cameras is None:
+        if self.config.polish.polish_looks == 0 or self.priors.cameras is None:
             return outcome
         done = polish(
             outcome.prediction, outcome.cameras, self.terms, self.config, self.generator, report, self.watched

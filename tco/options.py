@@ -50,13 +50,15 @@ class AblationConfig:
 class PolishConfig:
     """Refinement of each pixel's depth after the network was adapted (``tco/polish.py``)."""
 
-    polish_steps: int = knob(
-        60, "steps on the depths themselves, after those on the network; 0, or no steps at all: none"
+    polish_looks: int = knob(
+        8,
+        "times that each view's depths are refined, after the steps on the network; 0, or no steps at all: "
+        "never",
     )
     polish_rate: float = knob(
         7e-3, "learning rate of the logarithms of the depths' factors (Adam); lower it if surfaces get rough"
     )
-    polish_sources: int = knob(2, "views whose depths each of these steps looks at")
+    polish_sources: int = knob(2, "views whose depths each step of these refines")
     polish_smoothness: float = knob(
         0.1,
         "weight of the mean difference between the logarithms of the factors of neighbouring pixels, less "
@@ -77,10 +79,14 @@ class PolishConfig:
     )
 
     def __post_init__(self) -> None:
-        if self.polish_steps < 0 or self.polish_sources < 1 or not self.polish_levels:
-            raise ValueError("polish_steps must not be negative, and there must be a source and a level")
+        if self.polish_looks < 0 or self.polish_sources < 1 or not self.polish_levels:
+            raise ValueError("polish_looks must not be negative, and there must be a source and a level")
         if self.polish_smoothness < 0 or self.polish_consistency < 0:
             raise ValueError("polish_smoothness and polish_consistency are weights, not negative")
+
+    def steps(self, views: int) -> int:
+        """Steps that refine each of so many views as often as wanted."""
+        return -(-self.polish_looks * views // self.polish_sources)
 
 
 @dataclass(frozen=True)
@@ -165,10 +171,9 @@ class TCOConfig:
     polish: PolishConfig = field(default_factory=PolishConfig)
     ablation: AblationConfig = field(default_factory=AblationConfig)
 
-    @property
-    def all_steps(self) -> int:
-        """Steps on the network and those on the depths, which only follow where there are some."""
-        return self.steps + self.polish.polish_steps if self.steps else 0
+    def all_steps(self, views: int) -> int:
+        """Steps on the network, and those on the depths of so many views, which only follow upon some."""
+        return self.steps + self.polish.steps(views) if self.steps else 0
 
     def __post_init__(self) -> None:
         if self.steps < 0 or self.targets < 1 or self.refresh < 1 or self.sources < 1:
@@ -186,5 +191,5 @@ class TCOConfig:
         ablation = replace(self.ablation, decode_all=True, source_order="uniform")
         return replace(
             self, sources=1, targets=EVERY, refresh=1, lazy_refresh=False, ablation=ablation,
-            polish=PolishConfig(polish_steps=0),
+            polish=PolishConfig(polish_looks=0),
         )  # fmt: skip

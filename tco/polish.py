@@ -111,9 +111,10 @@ def polish(
     optimiser = torch.optim.Adam(run.field.parameters(), c.polish_rate, BETAS)
     history: list[dict[str, float]] = []
     skipped: list[int] = []
-    for step in range(c.polish_steps):
+    steps = c.steps(len(prediction.depth))
+    for step in range(steps):
         for group in optimiser.param_groups:
-            group["lr"] = c.polish_rate * (1 - (1 - LAST_RATE) * step / c.polish_steps)
+            group["lr"] = c.polish_rate * (1 - (1 - LAST_RATE) * step / steps)
         optimiser.zero_grad(set_to_none=True)
         figures = {"loss": 0.0} | {name: float(value) for name, value in run.gradients().items()}
         if _finite(run.field, figures["loss"]):

@@ -32,7 +32,7 @@ from tests.conftest import Room
 
 ROOT = Path(__file__).resolve().parents[1]
 SIZE, STEPS = 128, 2
-SHORT = TCOConfig(steps=4, polish=PolishConfig(polish_steps=10))
+SHORT = TCOConfig(steps=4, polish=PolishConfig(polish_looks=4))
 
 Floats = NDArray[np.floating]
 

@@ -109,7 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     out.write("|---" * 8 + "|\n")
     # Steps on the network alone: those on the depths cost the same whatever the network.
     ours = TCOConfig(
-        steps=options.steps, lora_targets=("qkv", "proj", "fc1", "fc2"), polish=PolishConfig(polish_steps=0)
+        steps=options.steps, lora_targets=("qkv", "proj", "fc1", "fc2"), polish=PolishConfig(polish_looks=0)
     )
     for kind in options.networks:
         wrap, build, *sizes = NETWORKS[kind]

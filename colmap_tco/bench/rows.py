@@ -62,7 +62,7 @@ class Row:
 
 _FORWARD = (("steps", 0),)
 _SILENT = (("photometric_weight", 0.0), ("geometric_weight", 0.0), ("consistency_weight", 0.0),
-           ("polish", PolishConfig(polish_steps=0)))  # fmt: skip
+           ("polish", PolishConfig(polish_looks=0)))  # fmt: skip
 _SURFELS = (("free_depth", True), ("free_surfels", True))
 
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from tests.conftest import Room
 
 ROOT = Path(__file__).resolve().parents[2]
-FLAGS = ("--max_image_size", "128", "--chunk_size", "8", "--device", "cpu", "--polish_steps", "1")
+FLAGS = ("--max_image_size", "128", "--chunk_size", "8", "--device", "cpu", "--polish_looks", "1")
 """The settings of :func:`config` on a command line."""
 
 
@@ -46,7 +46,7 @@ def config(steps: int = 0, **changes: Any) -> DensifyConfig:
     """Small images, so that a run takes seconds."""
     plain = DensifyConfig(
         network=NetworkConfig(device="cpu", chunk_size=8),
-        tco=TCOConfig(steps=steps, polish=PolishConfig(polish_steps=1)),
+        tco=TCOConfig(steps=steps, polish=PolishConfig(polish_looks=1)),
         views=ViewConfig(max_image_size=128),
     )
     return replace(plain, **changes)

@@ -99,7 +99,7 @@ class Small(nn.Module):
         return self
 
 
-ALONE = PolishConfig(polish_steps=0)
+ALONE = PolishConfig(polish_looks=0)
 SMALL = TCOConfig(steps=6, lora_targets=("conv",), rate=0.01, polish=ALONE)
 QUICK = TCOConfig(steps=3, polish=ALONE)
 

@@ -135,7 +135,7 @@ def test_dense_depth_with_standard_deviations_is_compared_as_it_is(scene: Wall) 
 
 ALONE = TCOConfig(
     steps=60, rate=0.02, lora_targets=("plane",), photometric_weight=0, consistency_weight=0, sparse_weight=0,
-    camera_rate=0, polish=PolishConfig(polish_steps=0),
+    camera_rate=0, polish=PolishConfig(polish_looks=0),
 )  # fmt: skip
 """Nothing but what the caller adds."""
 
@@ -158,7 +158,7 @@ def test_an_extra_term_alone_brings_the_network_to_its_minimum(scene: Wall) -> N
 def test_an_extra_term_also_refines_the_depths_themselves(scene: Wall) -> None:
     """Toward depths that the network cannot say: what is left of the error falls in the steps on depths."""
     target = scene.depth * (1 + 0.02 * torch.linspace(-1, 1, 64).square())
-    config = replace(ALONE, polish=PolishConfig(polish_steps=40, polish_rate=3e-3))
+    config = replace(ALONE, polish=PolishConfig(polish_looks=20, polish_rate=7e-3))
     plain, refined = (
         optimize(Toy(), scene.views, scene.priors, c, extra=[towards(target)]) for c in (ALONE, config)
     )

@@ -20,7 +20,7 @@ from tco.toy import Toy, Wall, wall
 from tco.types import Cameras
 
 TRUE = (-0.15, 0.0, 0.5)
-ALONE = PolishConfig(polish_steps=0)
+ALONE = PolishConfig(polish_looks=0)
 FIT = TCOConfig(steps=12, rate=0.01, lora_targets=("plane",), camera_rate=0, polish=ALONE)
 
 

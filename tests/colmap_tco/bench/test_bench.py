@@ -199,7 +199,7 @@ def test_poses_from_depths_on_scannet(config: BenchConfig, tmp_path: Path) -> No
 def test_the_embedded_network_reconstructs_a_room_from_prior_cameras_alone(
     room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its points are triangulated from the pictures; half of what it finds is within 2 % of the room's depth."""
+    """Points are triangulated from the pictures; half of what is found is within 2 % of the room's depth."""
     from colmap_tco.datasets import CHOICES, Choice
 
     monkeypatch.setitem(CHOICES, "nrgbd", {"sparse": Choice(1)})

@@ -193,7 +193,7 @@ def test_published_settings_are_those_of_the_scripts_unless_the_user_says_otherw
     assert set(SCHEDULES) == set(CHOICES)
     found = published("7scenes", TCOConfig())
     assert (found.steps, found.rate, found.photometric_weight, found.lora_rank) == (40, 1e-3, 0.2, 4)
-    assert found.ablation.decode_all and found.targets == EVERY and found.polish.polish_steps == 0
+    assert found.ablation.decode_all and found.targets == EVERY and found.polish.polish_looks == 0
     assert published("dtu", TCOConfig(steps=7)).steps == 7
     poses = published("scannet", TCOConfig())
     assert (poses.photometric_weight, poses.geometric_weight, poses.depth_weight) == (0, 1, 1)
