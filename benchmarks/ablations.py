@@ -74,16 +74,17 @@ def main() -> None:
     """Command line."""
     parser = arguments(__doc__ or "")
     parser.add_argument("--only", default="", help="parts of names of variants, separated by commas")
-    parser.add_argument("--seeds", type=int, default=1, help="runs of each, of which the mean is shown")
+    parser.add_argument("--seeds", type=int, default=1, help="runs of each; their mean and spread are shown")
     args = parser.parse_args()
     network = load_sweep(args.weights or EMBEDDED)
     sets = [load(name, args.size, args.views) for name in args.sets]
     wanted = [word for word in args.only.split(",") if word]
     lines = [
         "# Ablations\n",
-        f"`python -m benchmarks.ablations --sets {' '.join(args.sets)}`: {args.views or 'all'} views of "
-        f"{args.size} pixels, {args.steps} "
-        f"steps, means of {args.seeds} run(s). Share of measured pixels within 5 %, median error, seconds.\n",
+        f"`python -m benchmarks.ablations --steps {args.steps} --seeds {args.seeds}`, sets "
+        f"{', '.join(args.sets)}: {args.views or 'all'} views of {args.size} pixels, {args.steps} "
+        f"steps on the network, means of {args.seeds} run(s). Share of measured pixels within 5 %, its "
+        "standard deviation over the runs, median error, seconds of CPU.\n",
         "| | " + " | ".join(args.sets) + " |",
         "|---" * (len(sets) + 1) + "|",
     ]
@@ -96,14 +97,15 @@ def main() -> None:
         for real in sets:
             figures = []
             for seed in range(args.seeds):
-                start = time.perf_counter()
+                start = time.process_time()
                 prediction = optimize(network, real.views, real.given, config, seed).prediction
-                seconds = time.perf_counter() - start
+                seconds = time.process_time() - start
                 figures.append(
                     (within(prediction, real.truth), median_error(prediction, real.truth), seconds)
                 )
             share, error, seconds = torch.tensor(figures).mean(0).tolist()
-            cells.append(f"{share:.3f} {100 * error:.2f} % {seconds:.0f} s")
+            spread = f" ± {torch.tensor(figures)[:, 0].std():.3f}" if args.seeds > 1 else ""
+            cells.append(f"{share:.3f}{spread} {100 * error:.2f} % {seconds:.0f} s")
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
         publish("\n".join(lines) + "\n", args.output) if args.output else publish(lines[-1] + "\n", None)
 

@@ -142,6 +142,18 @@ MUTATIONS = [
         ("down * field.diff(dim=0).abs()", "0 * field.diff(dim=0).abs()"),
         ('weights["warped"] = weights.pop("photometric")', 'weights.pop("photometric")'),
         ("if weight > 0}", "if weight < 0}"),
+        ("self.prediction.depth[chosen] * factor", "self.prediction.depth[chosen] / factor"),
+        ("self.now.depth[seen] = self.refined(seen).depth", "self.now.depth[seen] *= 1"),
+        ("view * len(self.levels) + i", "view + i * len(self.levels)"),
+    ),
+    *_of(
+        "tco/ssim.py",
+        "ssim",
+        ("smooth(a * b, window) - both", "smooth(a * b, window) + both"),
+        ("SIGMA = 1.5", "SIGMA = 1.6"),
+        ("C1, C2 = 0.01**2, 0.03**2", "C1, C2 = 0.01, 0.03**2"),
+        ("inner[:, 1 : p + 1] +=", "inner[:, :p] +="),
+        ("cv2.BORDER_CONSTANT", "cv2.BORDER_REFLECT_101"),
     ),
     *_of(
         "tco/corrections.py",

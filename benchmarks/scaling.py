@@ -2,8 +2,8 @@
 
     python -m benchmarks.scaling [--steps_list 0 5 10 20 40 80] [--output docs/scaling.md]
 
-Each number of steps is a run of its own, since the schedule depends on it. Seconds are those of the optimiser
-on the loaded network, from pixels to depths.
+Each number of steps is a run of its own, since the schedule depends on it. Seconds are CPU seconds of the
+optimiser on the loaded network, from pixels to depths.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ Row = tuple[int, float, float, float, float, float]
 
 def measure(network: Backbone, real: RealSet, steps: int, seed: int) -> Row:
     """One run."""
-    start = time.perf_counter()
+    start = time.process_time()
     outcome = optimize(network, real.views, real.given, TCOConfig(steps=steps), seed=seed)
-    seconds = time.perf_counter() - start
+    seconds = time.process_time() - start
     p = outcome.prediction
     errors = [e.abs() for e in errors_at_points(p, real.priors.held_out)]
     hidden = float(sum((e < 0.05).sum() for e in errors)) / max(1, sum(len(e) for e in errors))
@@ -67,7 +67,7 @@ def main() -> None:
         text += f"\n![steps against error]({args.output.with_suffix('.png').name})\n"
     for name, rows in curves.items():
         text += (
-            f"\n## {name}\n\n| steps | s | d2 | d5 | median error | hidden points within 5 % |\n"
+            f"\n## {name}\n\n| steps | CPU s | d2 | d5 | median error | hidden points within 5 % |\n"
             "|---|---|---|---|---|---|\n"
         )
         for steps, seconds, d2, d5, median, hidden in rows:
