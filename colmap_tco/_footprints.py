@@ -8,3 +8,7 @@ FITS: dict[tuple[str, str, str], tuple[float, float, float]] = {
     ("sweep", "cpu", "optimised"): (7.091e08, 440.8, 5072.7),
 }
 """(network, device, forward or optimised) → bytes fixed, bytes a pixel and view, bytes a pixel."""
+
+COUNTS: dict[tuple[str, str, str], tuple[float, float, float]] = {
+}
+"""Counted, to be added to that of pipeline: (network, type of products, mode) → the same."""
