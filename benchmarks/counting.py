@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any, NamedTuple
 
 import torch
@@ -18,6 +19,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+from benchmarks.backbone import drawn
 from tco.backbones import da3, pi3, vggt
 from tco.backbones.base import Backbone
 from tco.lora import LoRAConfig, adapted
@@ -30,6 +32,8 @@ NETWORKS: dict[str, tuple[Callable[[Any], nn.Module], Any, Callable[..., Any]]] 
     "da3-small": (da3.DA3Network, da3.DA3Config.small(), da3.DA3),
 }
 """Network, published sizes, backbone."""
+IN_EARNEST = ("da3", "da3-small")
+"""Networks that ask for values on their way, so that they are run with random weights."""
 STATES = 6
 """Copies of the adapters: themselves, gradients, two moments of Adam, the best state, the one before it."""
 
@@ -94,6 +98,12 @@ def empty(network: str, dtype: torch.dtype) -> Any:
         return wrap(build(config), dtype).eval()
 
 
+def random(network: str, dtype: torch.dtype) -> Any:
+    """A published network with random weights."""
+    build, config, wrap = NETWORKS[network]
+    return drawn(lambda: wrap(build(config), dtype), torch.device("cpu")).eval().requires_grad_(False)
+
+
 def fake(backbone: nn.Module) -> None:
     """Replace its tensors by ones that say they are on the CPU; call it within a ``FakeTensorMode``."""
     made: dict[int, nn.Parameter] = {}
@@ -110,13 +120,14 @@ def fake(backbone: nn.Module) -> None:
 def count(network: str, dtype: torch.dtype, size: tuple[int, int, int]) -> Count:
     """Count one size: views, width, height."""
     n, width, height = size
-    backbone: Backbone = empty(network, dtype)
-    module: Any = backbone
-    with FakeTensorMode():
-        fake(module)
+    module: Any = empty(network, dtype) if network not in IN_EARNEST else random(network, dtype)
+    backbone: Backbone = module
+    with nullcontext() if network in IN_EARNEST else FakeTensorMode():
+        if network not in IN_EARNEST:
+            fake(module)
         weights = sum(t.numel() * t.element_size() for t in tensors(module))
         views = Views(torch.zeros(n, 3, height, width), torch.ones(n, height, width) > 0, ("",) * n)
-        priors = Priors(Cameras(torch.zeros(n, 4, 4), torch.zeros(n, 3, 3)))
+        priors = Priors(Cameras(torch.eye(4).repeat(n, 1, 1), torch.eye(3).repeat(n, 1, 1)))
         with Alive(module) as alive:
             with torch.no_grad():
                 encoded = backbone.encode(views, priors)

@@ -38,17 +38,18 @@ Size = tuple[int, int, int]
 PIPELINE = "pipeline"
 COUNTED = ("vggt", "pi3", "da3", "da3-small")
 FITTED: dict[str, tuple[Size, ...]] = {
-    "sweep": ((4, 128, 96), (10, 128, 96), (4, 256, 192), (12, 256, 192), (4, 512, 384), (12, 512, 384)),
-    PIPELINE: ((4, 128, 96), (12, 256, 192), (4, 512, 384), (12, 512, 384)),
-    **dict.fromkeys(COUNTED, ((2, 280, 210), (4, 518, 392), (12, 518, 392))),
+    "sweep": ((4, 128, 96), (4, 256, 192), (15, 256, 192), (4, 512, 384), (15, 512, 384)),
+    PIPELINE: ((4, 128, 96), (12, 256, 192), (4, 512, 384)),
+    **dict.fromkeys(("vggt", "pi3"), ((2, 280, 210), (4, 518, 392), (12, 518, 392))),
+    **dict.fromkeys(("da3", "da3-small"), ((2, 84, 56), (5, 84, 56), (2, 168, 126), (4, 168, 126))),
 }
 """What the fits are made of."""
 CHECKED: dict[str, tuple[Size, ...]] = {
-    "sweep": ((7, 256, 192), (15, 256, 192), (4, 384, 288), (15, 384, 288), (7, 512, 384), (15, 512, 384)),
-    PIPELINE: ((7, 384, 288), (15, 512, 384)),
+    "sweep": ((7, 256, 192), (9, 384, 288), (15, 384, 288), (7, 512, 384)),
+    PIPELINE: ((9, 384, 288),),
     **dict.fromkeys(COUNTED, ((3, 140, 98), (2, 280, 210))),
 }
-"""What they are checked with: other sizes, most of them larger."""
+"""What they are checked with."""
 MODES = {"forward": 0, "optimised": 1}
 """Steps; one passes every place that allocates, where the views are tied to each other from the first."""
 POLISH_STEPS = 3
@@ -250,8 +251,7 @@ def forget_peak() -> None:
 
 def made(network: str, device: Any, dtype: Any) -> Any:
     """A network of the published size with random weights, or the embedded one, or nearly none."""
-    from benchmarks.backbone import drawn
-    from benchmarks.counting import NETWORKS
+    from benchmarks.counting import random
     from tco.backbones.weights import load_sweep
     from tco.toy import Toy
 
@@ -259,8 +259,7 @@ def made(network: str, device: Any, dtype: Any) -> Any:
         return load_sweep(device=device)
     if network == PIPELINE:
         return Toy().to(device)
-    build, config, wrap = NETWORKS[network]
-    return drawn(lambda: wrap(build(config), dtype), device).eval().requires_grad_(False)
+    return random(network, dtype).to(device)
 
 
 def chunk(folder: Path, asked: Size) -> tuple[Any, list[Any]]:
