@@ -122,8 +122,10 @@ def refit(options: argparse.Namespace, place: tuple[str, str]) -> None:
         for mode in options.modes:
             key = (network, where(network, place), mode)
             if network in COUNTED:
-                peaks = [counted(network, place[1], asked, mode) for asked in sizes]
-                fit = counts[network, place[1], mode] = fitted(peaks)
+                pairs = [counted(network, place[1], asked, mode) for asked in sizes]
+                fit = with_weights(fitted([peak for peak, _ in pairs]), pairs[0][1])
+                counts[network, place[1], mode] = fit
+                peaks = [Peak(peak.views, peak.pixels, peak.bytes + weights) for peak, weights in pairs]
             else:
                 found = [measured(network, place, asked, MODES[mode]) for asked in sizes]
                 peaks, process = [peak for peak, _ in found], found[-1][1]
@@ -134,15 +136,20 @@ def refit(options: argparse.Namespace, place: tuple[str, str]) -> None:
                 TABLE.write_text(source(process, fits, counts))
 
 
-def counted(network: str, dtype: str, asked: Size, mode: str) -> Peak:
-    """Bytes of the network and of its tensors."""
+def counted(network: str, dtype: str, asked: Size, mode: str) -> tuple[Peak, int]:
+    """Bytes of the network's tensors beside its weights, and of these."""
     import torch
 
     from benchmarks.counting import count
 
     found = count(network, getattr(torch, dtype), asked)
     views, width, height = asked
-    return Peak(views, width * height, found.weights + (found.optimised if MODES[mode] else found.forward))
+    return Peak(views, width * height, found.optimised if MODES[mode] else found.forward), found.weights
+
+
+def with_weights(fit: tuple[float, float, float], weights: float) -> tuple[float, float, float]:
+    """A fit to what comes beside weights, which are known exactly, and the weights."""
+    return fit[0] + weights, *fit[1:]
 
 
 def where(network: str, place: tuple[str, str]) -> str:

@@ -53,6 +53,22 @@ class There(torch.Tensor):
         return done(operation, args, kwargs or {})
 
 
+def _empty(size: list[int], stride: list[int], *, dtype: torch.dtype | None = None, **_: Any) -> There:
+    return There(torch.empty_strided(size, stride, dtype=dtype))
+
+
+def _filled(source: Tensor, into: Tensor, non_blocking: bool = False) -> Tensor:
+    assert isinstance(into, There)
+    into.inner.copy_(source.inner if isinstance(source, There) else source)
+    return into
+
+
+KERNELS = torch.library.Library("aten", "IMPL")
+"""What PyTorch calls by itself, where no mode sees it, to take lists of indices to where they are used."""
+KERNELS.impl("empty_strided", _empty, "PrivateUse1")
+KERNELS.impl("_copy_from", _filled, "PrivateUse1")
+
+
 class Elsewhere(TorchDispatchMode):
     """Makes tensors elsewhere where that is asked for."""
 
