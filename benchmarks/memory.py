@@ -202,7 +202,7 @@ def source(process: float, fits: Fits, counts: Fits) -> str:
     return "\n".join(
         [
             '"""Memory of each network, written by ``python -m benchmarks.memory``; do not edit."""\n',
-            f"PROCESS = {process:.3g}",
+            f"PROCESS = {number(process)}",
             '"""Bytes of a process that has imported everything and loaded no network."""\n',
             *table("FITS", fits),
             f'"""Measured: (network, device, forward or optimised) → {rows}"""\n',
@@ -216,14 +216,17 @@ def table(name: str, fits: Fits) -> list[str]:
     """Lines of a dictionary."""
     lines = [f"{name}: dict[tuple[str, str, str], tuple[float, float, float]] = {{"]
     for (network, where, mode), fit in sorted(fits.items()):
-        numbers = ", ".join(f"{x:.4g}" if "e" in f"{x:.4g}" else f"{x:.1f}" for x in fit)
+        numbers = ", ".join(map(number, fit))
         lines.append(f'    ("{network}", "{where}", "{mode}"): ({numbers}),')
     return [*lines, "}"]
 
 
-def measured_here(
-    network: str, place: tuple[str, str], asked: Size, steps: int
-) -> dict[str, Any]:
+def number(x: float) -> str:
+    """A number as the formatter writes it."""
+    return f"{x:.1f}" if x < 1e4 else f"{x:.3e}".replace("e+", "e")
+
+
+def measured_here(network: str, place: tuple[str, str], asked: Size, steps: int) -> dict[str, Any]:
     """Peak of this process, which must do nothing else."""
     import torch
 

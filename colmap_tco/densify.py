@@ -110,7 +110,8 @@ class Densified:
         memory = f"the memory was too little for the planned groups of views: {smaller} smaller ones\n"
         return (
             f"{self.folder / 'fused.ply'}: {r['points']} points from {r['images']['used']} views, {state}\n"
-            f"{memory if smaller else ''}{quality}; {sum(r['seconds'].values()):.0f} s; details in {self.folder / 'report.json'}"
+            f"{memory if smaller else ''}"
+            f"{quality}; {sum(r['seconds'].values()):.0f} s; details in {self.folder / 'report.json'}"
         )
 
 

@@ -1,4 +1,4 @@
-"""A process that may not have more memory goes on with smaller chunks, also when the network is already adapted."""
+"""A process that may not have more memory goes on with smaller chunks, also with the network adapted."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def starved(prediction, *others):
 optimize.polish = starved
 sys.exit(main(sys.argv[1:]))
 """
-"""More than four views find the address space of the process full when the network is adapted and their depths are refined."""
+"""More than four views find the address space of the process full when their depths are to be refined."""
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="only Linux limits the address space so")

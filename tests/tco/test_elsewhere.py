@@ -17,7 +17,7 @@ from tco.toy import wall
 from tests.elsewhere import NAME, PLACE, Elsewhere, There, moved
 from tests.tco.published import tiny_pi3, tiny_vggt
 
-CONFIG = TCOConfig(steps=3, refresh=2, reencode=1e-6, camera_rate=0.5, polish=PolishConfig(polish_steps=2))
+CONFIG = TCOConfig(steps=2, refresh=1, reencode=1e-6, camera_rate=0.5, polish=PolishConfig(polish_steps=1))
 """Every stage: depths computed anew, corrected cameras given to the network, depths refined."""
 
 
@@ -38,7 +38,7 @@ def test_the_whole_optimisation_runs_elsewhere(kind: str) -> None:
 
     On the CPU rendering and correlations are compiled loops, elsewhere they are tensor operations.
     """
-    scene = wall(3, (42, 56) if kind != "sweep" else (48, 64))
+    scene = wall(3, (42, 56) if kind != "sweep" else (32, 48))
     network: Any = {"sweep": load_sweep, "vggt": tiny_vggt, "pi3": tiny_pi3}[kind]()
     targets = ("qkv", "proj", "fc1", "fc2") if kind != "sweep" else TCOConfig().lora_targets
     config = TCOConfig(**{**vars(CONFIG), "lora_targets": targets})
