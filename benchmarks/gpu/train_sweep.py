@@ -64,7 +64,7 @@ def main() -> None:
         count = render(data, args.render_minutes, tuple(args.shape))
         if not count:
             sys.exit(
-                f"no sample was finished in {args.render_minutes} minutes: the loops are compiled first, which "
+                f"no sample was finished in {args.render_minutes} minutes: loops are compiled first, which "
                 "takes one on an idle machine; give --render-minutes more"
             )
     if args.minutes <= 0:
