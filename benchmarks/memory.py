@@ -2,11 +2,17 @@
 
 ``python -m benchmarks.memory`` prints a table of measured and fitted peaks; ``--write`` puts the fits into
 ``colmap_tco/_footprints.py``. ``--networks sweep`` measures that one alone and keeps the others' fits.
+``--check`` fits nothing: it measures at sizes that no fit has seen, and prints the ratio of what ``colmap-tco
+check`` predicts to what was measured. ``--sizes 3x140x98`` measures at those (views, width, height) instead.
 
 Every measurement is a process of its own that runs densify's own stage on a made-up workspace, without
 reading weights: memory does not depend on their values. On the CPU the peak is that of the resident memory
-once the network is there, on CUDA that of PyTorch's allocator. Published networks are measured with the
-matrix products in the type that ``--dtype`` names, which a CPU without bfloat16 would run in float32.
+once the network is there, on CUDA that of PyTorch's allocator.
+
+Published networks are too large to be measured at many sizes. Their own tensors are counted
+(:mod:`benchmarks.counting`), and added to what everything else takes, which is measured with a network of
+three numbers, ``pipeline``; ``--check`` measures the sum. Their matrix products are in the type that
+``--dtype`` names, which a CPU without bfloat16 would run in float32.
 """
 
 from __future__ import annotations
@@ -16,7 +22,7 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,16 +32,31 @@ from numpy.typing import NDArray
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLE = ROOT / "colmap_tco" / "_footprints.py"
-SIZES = {
-    "sweep": ((4, 128, 96), (10, 128, 96), (4, 256, 192), (12, 256, 192), (4, 512, 384), (9, 512, 384)),
-    "vggt": ((2, 84, 56), (5, 84, 56), (2, 168, 126), (4, 168, 126)),
-    "pi3": ((2, 84, 56), (5, 84, 56), (2, 168, 126), (4, 168, 126)),
-    "da3": ((2, 84, 56), (5, 84, 56), (2, 168, 126), (4, 168, 126)),
-    "da3-small": ((2, 84, 56), (5, 84, 56), (2, 168, 126), (4, 168, 126)),
+Size = tuple[int, int, int]
+"""Views, width and height of the canvas."""
+
+PIPELINE = "pipeline"
+COUNTED = ("vggt", "pi3", "da3", "da3-small")
+FITTED: dict[str, tuple[Size, ...]] = {
+    "sweep": ((4, 128, 96), (4, 256, 192), (15, 256, 192), (4, 512, 384), (15, 512, 384)),
+    PIPELINE: ((4, 128, 96), (12, 256, 192), (4, 512, 384)),
+    **dict.fromkeys(("vggt", "pi3"), ((2, 280, 210), (4, 518, 392), (12, 518, 392))),
+    **dict.fromkeys(("da3", "da3-small"), ((2, 84, 56), (5, 84, 56), (2, 168, 126), (4, 168, 126))),
 }
-"""(views, width, height) that are measured by default."""
+"""What the fits are made of."""
+CHECKED: dict[str, tuple[Size, ...]] = {
+    "sweep": ((7, 256, 192), (9, 384, 288), (15, 384, 288), (7, 512, 384)),
+    PIPELINE: ((9, 384, 288),),
+    **dict.fromkeys(COUNTED, ((3, 140, 98), (2, 280, 210))),
+}
+"""What they are checked with."""
 MODES = {"forward": 0, "optimised": 1}
 """Steps; one passes every place that allocates, where the views are tied to each other from the first."""
+POLISH_STEPS = 3
+"""On the depths after them; the first already holds all that the later ones do."""
+COPIES = 1.2
+"""Measured over counted bytes of an optimised network's tensors, for VGGT-1B and π³ at the sizes that are
+checked: kernels copy operands, and freed memory is not always used again."""
 
 
 @dataclass(frozen=True)
@@ -48,57 +69,114 @@ class Peak:
 
 
 def main() -> None:
-    """Measure, fit, print, write."""
+    """Measure; fit, print and write, or print what the estimates say."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--networks", nargs="+", default=["sweep"], choices=list(SIZES))
+    parser.add_argument("--networks", nargs="+", default=["sweep"], choices=list(FITTED))
+    parser.add_argument("--modes", nargs="+", default=list(MODES), choices=list(MODES))
+    parser.add_argument("--sizes", nargs="+", type=size, help="VIEWSxWIDTHxHEIGHT, in place of the usual")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--dtype", default="bfloat16", choices=["bfloat16", "float32"])
-    parser.add_argument("--write", action="store_true", help="put the fits into colmap_tco/_footprints.py")
-    parser.add_argument("--one", nargs=5, metavar=("NETWORK", "VIEWS", "WIDTH", "HEIGHT", "STEPS"))
+    task = parser.add_mutually_exclusive_group()
+    task.add_argument("--write", action="store_true", help="put the fits into colmap_tco/_footprints.py")
+    task.add_argument("--check", action="store_true", help="compare predictions with measurements")
+    task.add_argument("--one", nargs=5, metavar=("NETWORK", "VIEWS", "WIDTH", "HEIGHT", "STEPS"))
     options = parser.parse_args()
+    place = (options.device, options.dtype)
     if options.one:
         network, *numbers = options.one
         views, width, height, steps = map(int, numbers)
-        place = (options.device, options.dtype)
         print(json.dumps(measured_here(network, place, (views, width, height), steps)))
         return
+    column = "predicted MB | predicted / measured" if options.check else "fitted MB | fitted / measured"
+    print(f"| network | device | mode | views | canvas | measured MB | {column} |\n" + "|---" * 8 + "|")
+    fit_or_check = compare if options.check else refit
+    fit_or_check(options, place)
+
+
+def size(text: str) -> Size:
+    """Views, width and height from ``3x140x98``."""
+    views, width, height = map(int, text.split("x"))
+    return views, width, height
+
+
+def compare(options: argparse.Namespace, place: tuple[str, str]) -> None:
+    """Print what the estimates that ``colmap-tco check`` uses say of sizes that they were not fitted to."""
+    from colmap_tco.memory import footprint
+
+    for network in options.networks:
+        for mode in options.modes:
+            steps = MODES[mode]
+            needs = footprint(network, place[0], steps, place[1])
+            for asked in options.sizes or CHECKED[network]:
+                peak, _ = measured(network, place, asked, steps)
+                key = (network, where(network, place), mode)
+                show(key, asked, peak, needs.bytes(peak.views, peak.pixels))
+
+
+def refit(options: argparse.Namespace, place: tuple[str, str]) -> None:
+    """Fit, print, and write if that is wanted."""
     from colmap_tco import _footprints
 
-    fits, process = dict(_footprints.FITS), _footprints.PROCESS
-    print(
-        "| network | device | mode | views | canvas | measured MB | fitted MB | error |\n" + "|---" * 8 + "|"
-    )
+    fits, counts, process = dict(_footprints.FITS), dict(_footprints.COUNTS), _footprints.PROCESS
     for network in options.networks:
-        for mode, steps in MODES.items():
-            peaks, process = series(network, (options.device, options.dtype), steps)
-            fit = fitted(peaks)
-            where = options.device if network == "sweep" else f"{options.device}:{options.dtype}"
-            fits[network, where, mode] = fit
-            for peak, size in zip(peaks, SIZES[network], strict=True):
-                row = (network, where, mode, str(peak.views), f"{size[1]}×{size[2]}")
-                guess = predicted(fit, peak)
-                cells = (f"{peak.bytes / 1e6:.0f}", f"{guess / 1e6:.0f}", f"{guess / peak.bytes - 1:+.1%}")
-                print("| " + " | ".join(row + cells) + " |", flush=True)
-    if options.write:
-        TABLE.write_text(source(process, fits))
+        sizes = options.sizes or FITTED[network]
+        for mode in options.modes:
+            key = (network, where(network, place), mode)
+            if network in COUNTED:
+                pairs = [counted(network, place[1], asked, mode) for asked in sizes]
+                fit = with_weights(fitted([peak for peak, _ in pairs]), pairs[0][1])
+                counts[network, place[1], mode] = fit
+                peaks = [Peak(peak.views, peak.pixels, peak.bytes + weights) for peak, weights in pairs]
+            else:
+                found = [measured(network, place, asked, MODES[mode]) for asked in sizes]
+                peaks, process = [peak for peak, _ in found], found[-1][1]
+                fit = fits[key] = fitted(peaks)
+            for asked, peak in zip(sizes, peaks, strict=True):
+                show(key, asked, peak, predicted(fit, peak))
+            if options.write:
+                TABLE.write_text(source(process, fits, counts))
 
 
-def series(network: str, place: tuple[str, str], steps: int) -> tuple[list[Peak], float]:
-    """Peaks at all sizes, each of a process of its own, and the bytes of a process without a network."""
-    peaks, process = [], 0.0
-    for views, width, height in SIZES[network]:
-        words = [network, *map(str, (views, width, height, steps))]
-        options = ["--device", place[0], "--dtype", place[1], "--one", *words]
-        command = [sys.executable, "-m", "benchmarks.memory", *options]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-        if done.returncode:
-            sys.exit(f"{' '.join(command)} failed:\n{done.stderr}")
-        figures = json.loads(done.stdout.splitlines()[-1])
-        peaks.append(Peak(figures["views"], figures["pixels"], figures["bytes"]))
-        process = figures["process"]
-    return peaks, process
+def counted(network: str, dtype: str, asked: Size, mode: str) -> tuple[Peak, int]:
+    """Bytes of the network's tensors beside its weights, and of these."""
+    import torch
+
+    from benchmarks.counting import count
+
+    found = count(network, getattr(torch, dtype), asked)
+    views, width, height = asked
+    alive = COPIES * found.optimised if MODES[mode] else found.forward
+    return Peak(views, width * height, round(alive)), found.weights
+
+
+def with_weights(fit: tuple[float, float, float], weights: float) -> tuple[float, float, float]:
+    """A fit to what comes beside weights, which are known exactly, and the weights."""
+    return fit[0] + weights, *fit[1:]
+
+
+def where(network: str, place: tuple[str, str]) -> str:
+    """Device, and the type of the products for the networks that can be told it."""
+    return ":".join(place) if network in COUNTED else place[0]
+
+
+def show(key: tuple[str, str, str], asked: Size, peak: Peak, guess: float) -> None:
+    """Print a row."""
+    cells = (str(peak.views), f"{asked[1]}×{asked[2]}", f"{peak.bytes / 1e6:.0f}", f"{guess / 1e6:.0f}")
+    print("| " + " | ".join([*key, *cells, f"{guess / peak.bytes:.2f}"]) + " |", flush=True)
+
+
+def measured(network: str, place: tuple[str, str], asked: Size, steps: int) -> tuple[Peak, float]:
+    """Peak of a process of its own, and the bytes of a process without a network."""
+    words = [network, *map(str, (*asked, steps))]
+    options = ["--device", place[0], "--dtype", place[1], "--one", *words]
+    command = [sys.executable, "-m", "benchmarks.memory", *options]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    if done.returncode:
+        sys.exit(f"{' '.join(command)} failed:\n{done.stderr}")
+    figures = json.loads(done.stdout.splitlines()[-1])
+    return Peak(figures["views"], figures["pixels"], figures["bytes"]), figures["process"]
 
 
 def fitted(peaks: Sequence[Peak]) -> tuple[float, float, float]:
@@ -119,27 +197,40 @@ def predicted(fit: tuple[float, float, float], peak: Peak) -> float:
     return fixed + peak.pixels * (peak.views * per_view + per_step)
 
 
-def source(process: float, fits: dict[tuple[str, str, str], tuple[float, float, float]]) -> str:
+Fits = Mapping[tuple[str, str, str], tuple[float, float, float]]
+
+
+def source(process: float, fits: Fits, counts: Fits) -> str:
     """The module that holds the fits."""
-    lines = [
-        '"""Measured memory of each network, written by ``python -m benchmarks.memory``; do not edit."""\n',
-        f"PROCESS = {process:.3g}",
-        '"""Bytes of a process that has imported everything and loaded no network."""\n',
-        "FITS: dict[tuple[str, str, str], tuple[float, float, float]] = {",
-    ]
-    for (network, device, mode), fit in sorted(fits.items()):
-        numbers = ", ".join(f"{x:.4g}" if "e" in f"{x:.4g}" else f"{x:.1f}" for x in fit)
-        lines.append(f'    ("{network}", "{device}", "{mode}"): ({numbers}),')
-    lines.append("}")
-    lines.append(
-        '"""(network, device, forward or optimised) → bytes fixed, bytes a pixel and view, bytes a pixel."""'
+    rows = "bytes fixed, bytes a pixel and view, bytes a pixel."
+    return "\n".join(
+        [
+            '"""Memory of each network, written by ``python -m benchmarks.memory``; do not edit."""\n',
+            f"PROCESS = {number(process)}",
+            '"""Bytes of a process that has imported everything and loaded no network."""\n',
+            *table("FITS", fits),
+            f'"""Measured: (network, device, forward or optimised) → {rows}"""\n',
+            *table("COUNTS", counts),
+            f'"""Counted: (network, type of products, mode) → the same, beside that of {PIPELINE}."""\n',
+        ]
     )
-    return "\n".join(lines) + "\n"
 
 
-def measured_here(
-    network: str, place: tuple[str, str], size: tuple[int, int, int], steps: int
-) -> dict[str, Any]:
+def table(name: str, fits: Fits) -> list[str]:
+    """Lines of a dictionary."""
+    lines = [f"{name}: dict[tuple[str, str, str], tuple[float, float, float]] = {{"]
+    for (network, where, mode), fit in sorted(fits.items()):
+        numbers = ", ".join(map(number, fit))
+        lines.append(f'    ("{network}", "{where}", "{mode}"): ({numbers}),')
+    return [*lines, "}"]
+
+
+def number(x: float) -> str:
+    """A number as the formatter writes it."""
+    return f"{x:.1f}" if x < 1e4 else f"{x:.3e}".replace("e+", "e")
+
+
+def measured_here(network: str, place: tuple[str, str], asked: Size, steps: int) -> dict[str, Any]:
     """Peak of this process, which must do nothing else."""
     import torch
 
@@ -147,7 +238,7 @@ def measured_here(
 
     device = torch.device(place[0])
     with tempfile.TemporaryDirectory() as folder:
-        tracks, views = chunk(Path(folder), size)
+        tracks, views = chunk(Path(folder), asked)
         process = resident("VmRSS")
         backbone = made(network, device, getattr(torch, place[1]))
         forget_peak()
@@ -173,36 +264,25 @@ def forget_peak() -> None:
 
 
 def made(network: str, device: Any, dtype: Any) -> Any:
-    """A network of the published size, with weights that do no harm."""
-    import torch
-
-    from tco.backbones import da3, pi3, vggt
+    """A network of the published size with random weights, or the embedded one, or nearly none."""
+    from benchmarks.counting import random
     from tco.backbones.weights import load_sweep
+    from tco.toy import Toy
 
     if network == "sweep":
         return load_sweep(device=device)
-    build, config, wrap = {
-        "vggt": (vggt.VGGTNetwork, vggt.VGGTConfig.vggt_1b(), vggt.VGGT),
-        "pi3": (pi3.Pi3Network, pi3.Pi3Config.large(), pi3.Pi3),
-        "da3": (da3.DA3Network, da3.DA3Config.base(), da3.DA3),
-        "da3-small": (da3.DA3Network, da3.DA3Config.small(), da3.DA3),
-    }[network]
-    with torch.device("meta"):
-        empty = build(config)
-    inner = empty.to_empty(device="cpu")
-    with torch.no_grad():
-        for name, tensor in inner.state_dict(keep_vars=True).items():
-            tensor.fill_(1e-3 if name.endswith("weight") else 0.0)
-    return wrap(inner, dtype).eval().requires_grad_(False).to(device)
+    if network == PIPELINE:
+        return Toy().to(device)
+    return random(network, dtype).to(device)
 
 
-def chunk(folder: Path, size: tuple[int, int, int]) -> tuple[Any, list[Any]]:
+def chunk(folder: Path, asked: Size) -> tuple[Any, list[Any]]:
     """Tracks and views of a made-up workspace whose images have the size of the canvas."""
     from colmap_tco.tracks import read_tracks
     from colmap_tco.views import ViewConfig, make_views
     from colmap_tco.workspace import open_workspace
 
-    views, width, height = size
+    views, width, height = asked
     write_workspace(folder, views, width, height)
     workspace = open_workspace(folder, num_threads=1)
     made_views, _ = make_views(workspace, ViewConfig(max_image_size=max(width, height)), 2)
@@ -211,14 +291,18 @@ def chunk(folder: Path, size: tuple[int, int, int]) -> tuple[Any, list[Any]]:
 
 def run(backbone: Any, tracks: Any, views: list[Any], device: Any, steps: int) -> None:
     """The stage of densify that is measured, on all views as one chunk."""
+    from dataclasses import replace
+
     from colmap_tco.backbones import suited
     from colmap_tco.chunks import Chunk
     from colmap_tco.predict import predict_chunk
     from colmap_tco.priors import PriorConfig
     from colmap_tco.published import NETWORKS
-    from tco.options import TCOConfig
+    from tco.options import PolishConfig, TCOConfig
 
-    tco = suited(TCOConfig(steps=steps, consistency_start=0.0), NETWORKS[backbone.name])
+    plain = TCOConfig(steps=steps, consistency_start=0.0, polish=PolishConfig(polish_steps=POLISH_STEPS))
+    toy = backbone.name not in NETWORKS
+    tco = replace(plain, lora_targets=("plane",)) if toy else suited(plain, NETWORKS[backbone.name])
     settings = (PriorConfig(), tco, 0)
     predict_chunk(
         (backbone, device), tracks, views, Chunk(tuple(range(len(views)))), settings, lambda _: None

@@ -106,8 +106,11 @@ class Densified:
                 f"{100 * held['within_5_percent']:.1f} % of {held['points']} depths at held-out points "
                 f"within 5 % (median error {100 * held['median_error']:.2f} %)"
             )
+        smaller = sum(chunk["reduced"] for chunk in r["chunks"])
+        memory = f"the memory was too little for the planned groups of views: {smaller} smaller ones\n"
         return (
             f"{self.folder / 'fused.ply'}: {r['points']} points from {r['images']['used']} views, {state}\n"
+            f"{memory if smaller else ''}"
             f"{quality}; {sum(r['seconds'].values()):.0f} s; details in {self.folder / 'report.json'}"
         )
 

@@ -39,12 +39,16 @@ class PartlyDoneError(DensifyError):
 def is_out_of_memory(error: BaseException) -> bool:
     """Whether ``error`` is one of the ways in which Python, numpy, torch and OpenCV run out of memory.
 
-    Torch is not imported to find out: its CUDA error is known by its name, and its CPU allocator and
-    OpenCV raise general errors that only their texts tell apart.
+    Torch is not imported to find out: its CUDA error is known by its name, and its CPU allocator, its
+    libraries and OpenCV raise general errors that only their texts tell apart.
     """
     if isinstance(error, MemoryError):
         return True
     if any(cls.__name__ == "OutOfMemoryError" for cls in type(error).__mro__):
         return True
-    text = str(error)
-    return "can't allocate memory" in text or "Insufficient memory" in text
+    text = str(error).lower()
+    return any(words in text for words in NO_MEMORY)
+
+
+NO_MEMORY = ("can't allocate memory", "insufficient memory", "out of memory", "bad_alloc", "alloc_failed")
+"""Of PyTorch's CPU allocator, OpenCV, the drivers of devices, C++, cuBLAS and cuDNN, in small letters."""

@@ -1,7 +1,7 @@
 """How much memory there is, how much a chunk takes, and so how many views fit.
 
-The footprints are fits to measured peaks (``python -m benchmarks.memory``); nothing here imports torch
-before it is asked about a device.
+The footprints are fits to peaks, measured and counted (``python -m benchmarks.memory``); nothing here
+imports torch before it is asked about a device.
 """
 
 from __future__ import annotations
@@ -25,29 +25,8 @@ SHARE = 0.7
 MOST_VIEWS, FEWEST_VIEWS = 40, 2
 """Views of a chunk: more do not help each other, and one has nothing to be compared with."""
 
-
-ESTIMATES: dict[tuple[str, str, str], tuple[float, float, float]] = {
-    ("vggt", "float32", "forward"): (5.1e9, 2000.0, 5000.0),
-    ("vggt", "float32", "optimised"): (5.1e9, 17300.0, 10000.0),
-    ("vggt", "bfloat16", "forward"): (3.3e9, 2000.0, 5000.0),
-    ("vggt", "bfloat16", "optimised"): (3.3e9, 10400.0, 10000.0),
-    ("pi3", "float32", "forward"): (4.2e9, 2000.0, 5000.0),
-    ("pi3", "float32", "optimised"): (4.2e9, 13000.0, 10000.0),
-    ("pi3", "bfloat16", "forward"): (2.3e9, 2000.0, 5000.0),
-    ("pi3", "bfloat16", "optimised"): (2.3e9, 7800.0, 10000.0),
-    ("da3", "float32", "forward"): (1.1e9, 2000.0, 5000.0),
-    ("da3", "float32", "optimised"): (1.1e9, 2900.0, 10000.0),
-    ("da3", "bfloat16", "forward"): (0.95e9, 2000.0, 5000.0),
-    ("da3", "bfloat16", "optimised"): (0.95e9, 2000.0, 10000.0),
-    ("da3-small", "float32", "forward"): (0.7e9, 1000.0, 5000.0),
-    ("da3-small", "float32", "optimised"): (0.7e9, 1450.0, 10000.0),
-    ("da3-small", "bfloat16", "forward"): (0.65e9, 1000.0, 5000.0),
-    ("da3-small", "bfloat16", "optimised"): (0.65e9, 1000.0, 10000.0),
-}
-"""Until ``benchmarks/memory.py`` was run for a network: its parameters, of those of the blocks half in
-bfloat16, and the process; 360 bytes a pixel that each adapted block keeps in float32 (48 blocks for vggt, 36
-for pi3), six tenths of it in bfloat16; the rest are guesses on the safe side. For da3 (8 adapted blocks, 768
-channels; da3-small 384) they lie 1 to 18 % above the peaks of three views of 168×126 in float32 on a CPU."""
+PIPELINE = "pipeline"
+"""Everything but the network, in the table of what was measured."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +37,8 @@ class Footprint:
         fixed: the process with the network loaded.
         per_view: what stays for each view, bytes a pixel of the canvas.
         per_step: what one step or one decoding takes beside that, bytes a pixel of the canvas.
-        measured: on what kind of device it was measured; empty if it is derived from another's or estimated.
+        measured: on what kind of device it was measured, for a published network all but its own tensors,
+            which are counted; empty if it is derived from another device's.
     """
 
     fixed: float
@@ -75,7 +55,7 @@ class Footprint:
         return (room - self.fixed - pixels * self.per_step) / (pixels * self.per_view)
 
 
-def footprint(network: str, device: str, steps: int) -> Footprint:
+def footprint(network: str, device: str, steps: int, dtype: str | None = None) -> Footprint:
     """Of a network (a key of :data:`colmap_tco.published.NETWORKS`) on a kind of device.
 
     Args:
@@ -84,16 +64,19 @@ def footprint(network: str, device: str, steps: int) -> Footprint:
             it needs on the CPU, less the process, which is not in the device's memory.
             The type in which a device multiplies matrices counts: bfloat16 takes half of float32.
         steps: of optimisation; 0 takes less.
+        dtype: of the products of published networks, if it is not that in which the device takes them.
     """
-    kind = network.removesuffix("-commercial")
-    mode, dtype, fits = "optimised" if steps else "forward", _products(device), _footprints.FITS
-    for place in (f"{device}:{dtype}", device):
-        if (kind, place, mode) in fits:
-            return Footprint(*fits[kind, place, mode], measured=place)
-    elsewhere = [fits[kind, p, mode] for p in (f"cpu:{dtype}", "cpu") if (kind, p, mode) in fits]
-    fixed, per_view, per_step = elsewhere[0] if elsewhere else ESTIMATES[kind, dtype, mode]
-    process = 0.0 if device == "cpu" else _footprints.PROCESS
-    return Footprint(max(0.0, fixed - process), per_view, per_step, measured="")
+    kind, mode = network.removesuffix("-commercial"), "optimised" if steps else "forward"
+    counts = _footprints.COUNTS.get((kind, dtype or _products(device), mode))
+    measured = kind if counts is None else PIPELINE
+    place = device if (measured, device, mode) in _footprints.FITS else "cpu"
+    fixed, per_view, per_step = _footprints.FITS[measured, place, mode]
+    if place != device:
+        fixed = max(0.0, fixed - _footprints.PROCESS)
+    more = counts or (0.0, 0.0, 0.0)
+    return Footprint(
+        fixed + more[0], per_view + more[1], per_step + more[2], measured=place if place == device else ""
+    )
 
 
 def _products(device: str) -> str:

@@ -61,7 +61,12 @@ def main() -> None:
     args = parser.parse_args()
     data = args.work / "data"
     if args.render_minutes > 0:
-        render(data, args.render_minutes, tuple(args.shape))
+        count = render(data, args.render_minutes, tuple(args.shape))
+        if not count:
+            sys.exit(
+                f"no sample was finished in {args.render_minutes} minutes: loops are compiled first, which "
+                "takes one on an idle machine; give --render-minutes more"
+            )
     if args.minutes <= 0:
         return
     args.out.mkdir(parents=True, exist_ok=True)

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import pickle
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,14 +22,21 @@ _Network = TypeVar("_Network", bound=nn.Module)
 CONFIG = "config"
 """Key of the sizes, as JSON, in the metadata of files that :func:`save` wrote."""
 
+ZIP = b"PK\x03\x04"
+"""Beginning of the files that ``torch.save`` writes."""
+
 
 def load_network(
     path: Path,
     build: Callable[[_Config], _Network],
     published: _Config | Callable[[Mapping[str, Tensor]], _Config],
     skipped: tuple[str, ...] = (),
+    products: tuple[Callable[[_Network], Sequence[nn.Module]], torch.dtype] | None = None,
 ) -> _Network:
-    """A network on the CPU with the tensors of a file, which are not copied.
+    """A network on the CPU with the tensors of a file.
+
+    Tensors that keep their type are not copied but read when they are first used. If some change theirs, all
+    are copied, a few at a time, so that the memory never holds much more than the network.
 
     Args:
         path: a file that :func:`read` reads.
@@ -37,6 +44,8 @@ def load_network(
         published: the sizes, unless the file's metadata has others; where checkpoints of several sizes are
             published, a function that tells them from the tensors.
         skipped: prefixes of names that the file may hold and that the network has no use for.
+        products: modules of the network whose linear layers are kept in a type, and the type; float32 is that
+            of the files.
 
     Raises:
         WeightsError: see :func:`read`; names or shapes differ from those of the network.
@@ -48,12 +57,50 @@ def load_network(
     with torch.device("meta"):
         network = build(config)
     used = {name: tensor for name, tensor in tensors.items() if not name.startswith(skipped or ("\0",))}
-    for names in tied(network):
-        stored = [name for name in names if name in used]
-        used.update({name: used[stored[0]] for name in names if len(stored) == 1})
-    check(network, used, path)
-    network.load_state_dict(used, assign=True)
+    check(network, _with_tied(network, used), path)
+    if products is not None and products[1] is not torch.float32:
+        modules, dtype = products
+        change = linear_names(network, modules(network))
+        del tensors
+        used = dict(_copies(path, list(used), change, dtype))
+    network.load_state_dict(_with_tied(network, used), assign=True)
     return network
+
+
+def linear_names(network: nn.Module, modules: Iterable[nn.Module]) -> set[str]:
+    """Names in a network of the parameters of the linear layers in some of its modules."""
+    linear = {id(part) for module in modules for part in module.modules() if isinstance(part, nn.Linear)}
+    return {
+        f"{name}.{parameter}"
+        for name, module in network.named_modules()
+        if id(module) in linear
+        for parameter, _ in module.named_parameters(recurse=False)
+    }
+
+
+def _copies(
+    path: Path, names: Sequence[str], change: Collection[str], dtype: torch.dtype
+) -> Iterator[tuple[str, Tensor]]:
+    """Copies of tensors of a file, some of them in another type.
+
+    What is read of an open file stays in memory until it is closed, so it is opened again and again.
+    """
+    with path.open("rb") as file:
+        every = len(names) if file.read(4) == ZIP else 16
+    for k in range(0, len(names), every):
+        tensors, _ = read(path)
+        for name in names[k : k + every]:
+            tensor = tensors[name]
+            yield name, tensor.to(dtype if name in change else tensor.dtype, copy=True)
+
+
+def _with_tied(network: nn.Module, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors by name, those that the network has under several names under all of them."""
+    every = dict(tensors)
+    for names in tied(network):
+        stored = [name for name in names if name in every]
+        every.update({name: every[stored[0]] for name in names if len(stored) == 1})
+    return every
 
 
 def tied(network: nn.Module) -> list[list[str]]:
@@ -83,7 +130,7 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         raise WeightsError(f"{path}: no such file of weights")
     with path.open("rb") as file:
         head = file.read(512)
-    if head.startswith(b"PK\x03\x04"):
+    if head.startswith(ZIP):
         return _read_torch(path), {}
     foreign = _kind(head)
     if foreign and head[8:9] != b"{":  # the length that safetensors begins with can be any bytes

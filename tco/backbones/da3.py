@@ -92,6 +92,16 @@ class DA3Network(nn.Module):
         self.config = config
         self.model = _assembled(config)
 
+    @property
+    def transformer(self) -> Any:
+        """The package's vision transformer."""
+        return self.model.get_submodule("backbone.pretrained")
+
+
+def products(network: DA3Network) -> list[nn.Module]:
+    """The blocks, whose matrix products are taken in the type of the device."""
+    return [network.transformer.blocks]
+
 
 def _assembled(c: DA3Config) -> nn.Module:
     """The package's network, with its messages of progress kept off the standard output."""
@@ -176,12 +186,12 @@ class DA3(nn.Module):
         """
         super().__init__()
         self.network, self.dtype, self.recompute = network, dtype, recompute
-        store_products([self.transformer.blocks], dtype)
+        store_products(products(network), dtype)
 
     @property
     def transformer(self) -> Any:
         """The package's vision transformer."""
-        return self.network.model.get_submodule("backbone.pretrained")
+        return self.network.transformer
 
     def decoder(self) -> nn.Module:
         """The blocks from the first on that sees the tokens of the cameras."""
@@ -200,7 +210,7 @@ class DA3(nn.Module):
             x = vit.prepare_tokens_with_masks(normalized(views.images).unsqueeze(0))
             for i in range(self.network.config.start - 1):
                 x = vit.process_attention(x, vit.blocks[i], "local")
-            reference = _reference(x)
+            reference = _reference(x) if priors.cameras is None else 0
             x = vit.process_attention(x, vit.blocks[self.network.config.start - 1], "local")
         x = x[0].clone()
         if priors.cameras is None:
@@ -322,6 +332,7 @@ def load(
         ModuleNotFoundError: the authors' package is not installed.
         WeightsError: the file is missing, damaged, or of another network.
     """
-    network = load_network(path, DA3Network, published)
     place = torch.device(device)
-    return DA3(network, dtype or compute_dtype(place), recompute).eval().requires_grad_(False).to(place)
+    dtype = dtype or compute_dtype(place)
+    network = load_network(path, DA3Network, published, products=(products, dtype))
+    return DA3(network, dtype, recompute).eval().requires_grad_(False).to(place)

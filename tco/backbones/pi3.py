@@ -99,6 +99,12 @@ class Pi3Network(nn.Module):
         return torch.cat([before, x], -1)
 
 
+def products(network: Pi3Network) -> list[nn.Module]:
+    """The blocks, whose matrix products are taken in the type of the device."""
+    readers = (network.point_decoder, network.conf_decoder, network.camera_decoder)
+    return [network.encoder.blocks, network.decoder, *readers]
+
+
 class Pi3(nn.Module):
     """The backbone; satisfies :class:`tco.backbones.base.Backbone`."""
 
@@ -120,8 +126,7 @@ class Pi3(nn.Module):
         """
         super().__init__()
         self.network, self.dtype, self.recompute = network, dtype, recompute
-        readers = (network.point_decoder, network.conf_decoder, network.camera_decoder)
-        store_products([network.encoder.blocks, network.decoder, *readers], dtype)
+        store_products(products(network), dtype)
 
     def decoder(self) -> nn.Module:
         """The blocks between the patch encoder and the three decoders of single views."""
@@ -228,6 +233,7 @@ def load(
     Raises:
         WeightsError: the file is missing, damaged, or of another network.
     """
-    network = load_network(path, Pi3Network, Pi3Config.large())
     place = torch.device(device)
-    return Pi3(network, dtype or compute_dtype(place), recompute).eval().requires_grad_(False).to(place)
+    dtype = dtype or compute_dtype(place)
+    network = load_network(path, Pi3Network, Pi3Config.large(), products=(products, dtype))
+    return Pi3(network, dtype, recompute).eval().requires_grad_(False).to(place)

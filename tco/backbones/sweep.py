@@ -10,6 +10,7 @@ features of the source views and by the depths that the other views predict.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 
 import torch
@@ -19,7 +20,7 @@ from torch import Tensor, nn
 from tco.backbones.decoder import Decoder, SweepConfig, convex_upsample, soft_argmax
 from tco.backbones.layers import FeatureNet
 from tco.backbones.sweeping import Hints, interpolate_points, inverse_range, relative_cameras
-from tco.backbones.transformer import compute_dtype
+from tco.backbones.transformer import compute_dtype, computing
 from tco.backbones.warp import agree, correlate
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
 
@@ -75,12 +76,12 @@ def joined(stages: Sequence[Stage]) -> Stage:
     return Stage(torch.cat([s.inverse for s in stages]), torch.cat([s.log_error for s in stages]))
 
 
-def mixed(device: torch.device) -> torch.autocast:
+def mixed(device: torch.device) -> AbstractContextManager[object]:
     """Convolutions and products in bfloat16 where the device is faster in it, else in float32.
 
     Float64 is left alone, so that finite differences can be taken.
     """
-    return torch.autocast(device.type, torch.bfloat16, enabled=compute_dtype(device) == torch.bfloat16)
+    return computing(device, compute_dtype(device))
 
 
 def channels_last(module: nn.Module) -> None:

@@ -146,6 +146,12 @@ class VGGTNetwork(nn.Module):
         self.depth_head = DPTHead(2 * c.channels, c.features, c.levels, 2)
 
 
+def products(network: VGGTNetwork) -> list[nn.Module]:
+    """The blocks, whose matrix products are taken in the type of the device."""
+    a = network.aggregator
+    return [a.patch_embed.blocks, a.frame_blocks, a.global_blocks]
+
+
 class VGGT(nn.Module):
     """The backbone; satisfies :class:`tco.backbones.base.Backbone`."""
 
@@ -167,8 +173,7 @@ class VGGT(nn.Module):
         """
         super().__init__()
         self.network, self.dtype, self.recompute = network, dtype, recompute
-        a = network.aggregator
-        store_products([a.patch_embed.blocks, a.frame_blocks, a.global_blocks], dtype)
+        store_products(products(network), dtype)
 
     def decoder(self) -> nn.Module:
         """The frame and global blocks."""
@@ -233,6 +238,7 @@ def load(
     Raises:
         WeightsError: the file is missing, damaged, or of another network.
     """
-    network = load_network(path, VGGTNetwork, VGGTConfig.vggt_1b(), SKIPPED)
     place = torch.device(device)
-    return VGGT(network, dtype or compute_dtype(place), recompute).eval().requires_grad_(False).to(place)
+    dtype = dtype or compute_dtype(place)
+    network = load_network(path, VGGTNetwork, VGGTConfig.vggt_1b(), SKIPPED, (products, dtype))
+    return VGGT(network, dtype, recompute).eval().requires_grad_(False).to(place)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_tco._footprints import FITS, PROCESS
+from colmap_tco._footprints import COUNTS, FITS, PROCESS
 from colmap_tco.attempts import within_memory
 from colmap_tco.chunks import Chunk, plan_chunks
 from colmap_tco.memory import SHARE, Footprint, _left_in_container, chunk_limit, footprint, free_memory
@@ -70,18 +70,29 @@ def test_every_network_has_a_footprint(name: str, steps: int) -> None:
     assert footprint(name, "cpu", 0).bytes(8, 50_000) <= footprint(name, "cpu", 40).bytes(8, 50_000)
 
 
-def test_measurements_go_before_estimates() -> None:
-    for kind, place, mode in FITS:
-        device = place.partition(":")[0]
-        found = footprint(kind, device, steps=40 if mode == "optimised" else 0)
-        if found.measured == place:
-            assert (found.fixed, found.per_view, found.per_step) == FITS[kind, place, mode]
-    for name in NETWORKS:
-        for device in ("cpu", "cuda"):
-            assert bool(footprint(name, device, 40).measured) == any(
-                kind == name.removesuffix("-commercial") and place.partition(":")[0] == device
-                for kind, place, _ in FITS
-            )
+def test_footprints_are_those_of_the_tables() -> None:
+    """Measured where the network could be; else its own tensors beside what all the rest takes."""
+    for mode, steps in (("forward", 0), ("optimised", 40)):
+        found = footprint("sweep", "cpu", steps)
+        assert (found.fixed, found.per_view, found.per_step) == FITS["sweep", "cpu", mode]
+        assert found.measured == "cpu"
+        for (name, dtype, of), counts in COUNTS.items():
+            if of != mode:
+                continue
+            found, rest = footprint(name, "cpu", steps, dtype), FITS["pipeline", "cpu", mode]
+            sums = [c + r for c, r in zip(counts, rest, strict=True)]
+            assert [found.fixed, found.per_view, found.per_step] == pytest.approx(sums)
+            assert found.fixed > counts[0] > 0
+            assert footprint(name, "cuda", steps, dtype).fixed == pytest.approx(found.fixed - PROCESS)
+    assert not footprint("vggt", "cuda", 40).measured
+    assert footprint("vggt-commercial", "cpu", 40) == footprint("vggt", "cpu", 40)
+
+
+def test_bfloat16_takes_less_than_float32() -> None:
+    for name in ("vggt", "pi3", "da3", "da3-small"):
+        for steps in (0, 40):
+            half, whole = (footprint(name, "cpu", steps, dtype) for dtype in ("bfloat16", "float32"))
+            assert half.bytes(10, 200_000) < whole.bytes(10, 200_000) < 2 * half.bytes(10, 200_000)
 
 
 def ring(count: int) -> np.ndarray:

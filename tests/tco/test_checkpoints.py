@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from tco.backbones import pi3, vggt
-from tco.backbones.checkpoints import load_network, read, save, tied
+from tco.backbones.checkpoints import linear_names, load_network, read, save, tied
 from tco.backbones.weights import WeightsError
 from tests.tco.published import TINY_PI3, TINY_VGGT, some_views, tiny_pi3, tiny_vggt
 
@@ -54,6 +54,26 @@ def test_a_checkpoint_comes_back_as_it_was_written(
     ours, theirs = network.state_dict(), back.state_dict()
     assert ours.keys() == theirs.keys()
     assert all(torch.equal(ours[k], theirs[k]) for k in ours)
+
+
+@pytest.mark.parametrize("name", ["model.safetensors", "model.pt"])
+def test_a_network_read_in_another_type_is_the_one_converted_afterwards(
+    network: vggt.VGGTNetwork, tmp_path: Path, name: str
+) -> None:
+    """Only the linear layers of the blocks are in it, and nothing refers to the file any more."""
+    path = written(tmp_path / name, tensors_of(network))
+    read = load_network(path, vggt.VGGTNetwork, TINY_VGGT, (), (vggt.products, torch.bfloat16))
+    path.unlink()
+    ours, plain = read.state_dict(), network.state_dict()
+    linear = linear_names(read, vggt.products(read))
+    blocks = sum(len(list(part.modules())) for part in vggt.products(read))
+    assert 0 < len(linear) < blocks * 2 and all("blocks." in name for name in linear)
+    assert "depth_head.norm.weight" not in linear and "camera_head.trunk.0.attn.qkv.weight" not in linear
+    for key, tensor in plain.items():
+        expected = tensor.bfloat16() if key in linear else tensor
+        assert ours[key].dtype == expected.dtype and torch.equal(ours[key], expected)
+    afterwards = vggt.VGGT(loaded(written(path, tensors_of(network))), torch.bfloat16).network.state_dict()
+    assert all(torch.equal(afterwards[key], ours[key]) for key in ours)
 
 
 def test_a_header_of_any_length_is_read(tmp_path: Path) -> None:
