@@ -52,7 +52,7 @@ CHECKED: dict[str, tuple[Size, ...]] = {
 """What they are checked with."""
 MODES = {"forward": 0, "optimised": 1}
 """Steps; one passes every place that allocates, where the views are tied to each other from the first."""
-POLISH_STEPS = 3
+POLISH_LOOKS = 3
 """On the depths after them; the first already holds all that the later ones do."""
 COPIES = 1.2
 """Measured over counted bytes of an optimised network's tensors, for VGGT-1B and π³ at the sizes that are
@@ -300,7 +300,7 @@ def run(backbone: Any, tracks: Any, views: list[Any], device: Any, steps: int) -
     from colmap_tco.published import NETWORKS
     from tco.options import PolishConfig, TCOConfig
 
-    plain = TCOConfig(steps=steps, consistency_start=0.0, polish=PolishConfig(polish_steps=POLISH_STEPS))
+    plain = TCOConfig(steps=steps, consistency_start=0.0, polish=PolishConfig(polish_looks=POLISH_LOOKS))
     toy = backbone.name not in NETWORKS
     tco = replace(plain, lora_targets=("plane",)) if toy else suited(plain, NETWORKS[backbone.name])
     settings = (PriorConfig(), tco, 0)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).resolve().parents[2]
 FLAGS = (
-    "--max_image_size", "256", "--chunk_size", "8", "--device", "cpu", "--steps", "1", "--polish_steps", "1",
+    "--max_image_size", "256", "--chunk_size", "8", "--device", "cpu", "--steps", "1", "--polish_looks", "1",
     "--num_threads", "1", "--no-report_page",
 )  # fmt: skip
 

@@ -17,7 +17,7 @@ from tco.toy import wall
 from tests.elsewhere import NAME, PLACE, Elsewhere, There, moved
 from tests.tco.published import tiny_pi3, tiny_vggt
 
-CONFIG = TCOConfig(steps=2, refresh=1, reencode=1e-6, camera_rate=0.5, polish=PolishConfig(polish_steps=1))
+CONFIG = TCOConfig(steps=2, refresh=1, reencode=1e-6, camera_rate=0.5, polish=PolishConfig(polish_looks=1))
 """Every stage: depths computed anew, corrected cameras given to the network, depths refined."""
 
 
