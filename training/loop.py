@@ -63,6 +63,8 @@ class LoopConfig:
 class Loop(ABC):
     """Network, its moving average, optimiser and step count; saved and restored as one file.
 
+    ``shown`` counts the samples that this process trained on.
+
     Several processes, one thread each, take a sample each and average their gradients: on a CPU two
     threads in one process wait for each other longer than they gain.
     """
@@ -84,7 +86,7 @@ class Loop(ABC):
         self.optimiser = torch.optim.AdamW(
             self.net.parameters(), config.rate, weight_decay=config.weight_decay
         )
-        self.step = 0
+        self.step = self.shown = 0
         self.refresh()
         out.mkdir(parents=True, exist_ok=True)
         if (out / "state.pt").exists():
@@ -112,6 +114,7 @@ class Loop(ABC):
         self.mean.load_state_dict(state["mean"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.step, self.spent = int(state["step"]), float(state.get("spent", 0.0))
+        self.shown = int(state.get("shown", 0))
         logger.info("resumed at step %d, after %.1f minutes", self.step, self.spent / 60)
 
     def start_from(self, weights: Path) -> None:
@@ -128,7 +131,7 @@ class Loop(ABC):
         """Write the state and the averaged weights, atomically."""
         state = {
             "net": self.net.state_dict(), "mean": self.mean.state_dict(),
-            "optimiser": self.optimiser.state_dict(), "step": self.step, "spent": self.clock(),
+            "optimiser": self.optimiser.state_dict(), "step": self.step, "spent": self.clock(), "shown": self.shown,
         }  # fmt: skip
         torch.save(state, self.out / "state.part")
         (self.out / "state.part").replace(self.out / "state.pt")

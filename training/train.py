@@ -178,6 +178,7 @@ class Trainer(Loop):
     def loss(self) -> tuple[Tensor, Mapping[str, float]]:
         """Loss of this step's sample, with some views refined and some of the others as sources."""
         sample, rng = self.drawn()
+        self.shown += 1
         refined = sorted(rng.choice(len(sample[0]), self.config.refined, replace=False).tolist())
         return losses(self.net, sample, refined, int(rng.integers(2, len(sample[0]))))
 

@@ -103,6 +103,7 @@ class MiniTrainer(Loop):
         least, most = c.views
         views = int(rng.integers(least, min(most, self.pool.most) + 1))
         batch = self.pool.draw(rng, views, c.pixels, (height, width))
+        self.shown += len(batch.images)
         return losses(self.net, batch, self.dtype)
 
     @torch.no_grad()
