@@ -129,8 +129,8 @@ NETWORKS: dict[str, Network] = {
             image_size=192,
             stride=8,
             tco=_PAPER,
-            training="python -m benchmarks.gpu.train_mini, in a checkout, makes some within half an hour on a "
-            "large GPU (benchmarks/gpu/README.md)",
+            training="python -m benchmarks.gpu.train_mini, in a checkout, makes some within half an hour on "
+            "a large GPU (benchmarks/gpu/README.md)",
         ),
         Network(
             name="vggt",

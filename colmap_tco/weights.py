@@ -125,8 +125,8 @@ def cached(checkpoint: Checkpoint) -> Path | None:
 def none_yet(network: Network) -> str:
     """That a network has no weights to fetch and none in the package, and how to make some."""
     return (
-        f"no weights of {network.name} are in the package or published yet: {network.training}; then name the "
-        "file with --weights"
+        f"no weights of {network.name} are in the package or published yet: {network.training}; then name "
+        "the file with --weights"
     )
 
 

@@ -55,8 +55,8 @@ def test_render_parity(capsys: pytest.CaptureFixture[str]) -> None:
 def test_train_mini_resumes_and_tells_its_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two runs, one training; samples are there, so that none are rendered."""
     write(tmp_path / "work" / "data", 0, 4, (32, 48), 4)
-    words = ["--small", "--device", "cpu", "--cores", "0", "--first", "3", "--minutes", "0.02", "--schedule", "9",
-             "--work", str(tmp_path / "work"), "--out", str(tmp_path / "out")]  # fmt: skip
+    words = ["--small", "--device", "cpu", "--cores", "0", "--first", "3", "--minutes", "0.02", "--schedule",
+             "9", "--work", str(tmp_path / "work"), "--out", str(tmp_path / "out")]  # fmt: skip
     steps = []
     for _ in range(2):
         train_mini.main(words)
@@ -75,8 +75,18 @@ def test_train_mini_resumes_and_tells_its_errors(tmp_path: Path, capsys: pytest.
         train_mini.main([*words[:-4], "--work", str(tmp_path / "none"), "--out", str(tmp_path / "out")])
 
 
-def test_rendering_leaves_samples_and_no_parts(tmp_path: Path) -> None:
-    with rendering(tmp_path, (24, 32), cores=1, views=2, most=2):
-        assert wait_for(tmp_path, 1, minutes=2) >= 1
-    assert not list(tmp_path.glob("*.part"))
-    assert read(next(tmp_path.glob("1000000.npz"))).images.shape == (2, 24, 32, 3)
+def test_rendering_keeps_what_is_there_and_leaves_no_parts(tmp_path: Path) -> None:
+    """The one sample that is wanted is there: the process ends, and nothing is rendered again."""
+    (tmp_path / "1000000.npz").write_bytes(b"kept")
+    (tmp_path / "1000000.7.part").write_bytes(b"cut off")
+    with rendering(tmp_path, (48, 64), cores=1, views=2, most=1):
+        assert wait_for(tmp_path, 1, minutes=1) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["1000000.npz"]
+    assert (tmp_path / "1000000.npz").read_bytes() == b"kept"
+
+
+@pytest.mark.slow
+def test_rendering_renders(tmp_path: Path) -> None:
+    with rendering(tmp_path, (48, 64), cores=1, views=2, most=2):
+        assert wait_for(tmp_path, 1, minutes=10) >= 1
+    assert read(tmp_path / "1000000.npz").images.shape == (2, 48, 64, 3)

@@ -131,7 +131,8 @@ class Loop(ABC):
         """Write the state and the averaged weights, atomically."""
         state = {
             "net": self.net.state_dict(), "mean": self.mean.state_dict(),
-            "optimiser": self.optimiser.state_dict(), "step": self.step, "spent": self.clock(), "shown": self.shown,
+            "optimiser": self.optimiser.state_dict(), "step": self.step, "spent": self.clock(),
+            "shown": self.shown,
         }  # fmt: skip
         torch.save(state, self.out / "state.part")
         (self.out / "state.part").replace(self.out / "state.pt")

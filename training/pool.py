@@ -113,7 +113,7 @@ class Pool:
 
 
 def gathered(samples: Sequence[Held], orders: Sequence[Sequence[int]], size: tuple[int, int]) -> Scenes:
-    """Views of samples as one batch at a size (H, W): pictures averaged over areas, depths of the nearest pixel."""
+    """Views of samples as one batch at a size (H, W): pictures averaged, depths of the nearest pixel."""
     pairs = [(s, i) for s, order in zip(samples, orders, strict=True) for i in order]
     device = samples[0].images.device
     images = torch.stack([s.images[i] for s, i in pairs]).float() / 255
@@ -136,9 +136,7 @@ def mirrored(scenes: Scenes) -> Scenes:
     mirror = torch.diag(scenes.K.new_tensor([-1.0, 1.0, 1.0, 1.0]))
     K = scenes.K.clone()
     K[..., 0, 2] = scenes.size[1] - K[..., 0, 2]
-    return Scenes(
-        scenes.images.flip(-1), scenes.depth.flip(-1), mirror @ scenes.world_from_cam @ mirror, K
-    )
+    return Scenes(scenes.images.flip(-1), scenes.depth.flip(-1), mirror @ scenes.world_from_cam @ mirror, K)
 
 
 def photographed(images: Tensor, rng: Rng) -> Tensor:

@@ -2,8 +2,9 @@
 
 They are those of the paper (Wang et al. 2025, arXiv 2503.11651, section 3.4): the truth is expressed in the
 first camera and scaled so that the points of all views are 1 away from it on average; the prediction is not
-normalised. Where the paper leaves a number open it is that of its authors' training code (``training/loss.py``
-of github.com/facebookresearch/vggt), which also has L1 in place of the paper's Huber loss for cameras.
+normalised. Where the paper leaves a number open it is that of its authors' training code
+(``training/loss.py`` of github.com/facebookresearch/vggt), which also has L1 in place of the paper's Huber loss
+for cameras.
 """
 
 from __future__ import annotations
@@ -32,11 +33,11 @@ PARTS = (1.0, 1.0, 0.5)
 """Weights of translation, quaternion and fields of view."""
 
 ALPHA = 0.2
-"""Weight of the logarithm of the confidence: at an error e the best confidence is ALPHA / e, if that is above 1."""
+"""Weight of the logarithm of the confidence: at an error e the best one is ALPHA / e, if that is above 1."""
 
 LOGARITHM = 0.2
 """Weight of the error of the depth's logarithm, which the paper does not have: the head's exponential has no
-gradient where its depth is next to nothing, so a network trained from nothing could not come back from there."""
+gradient where its depth is next to nothing, so a network that starts from nothing could not come back."""
 
 SCALES = (1, 2, 4, 8)
 """Steps between the pixels whose differences the gradient loss compares."""
@@ -112,7 +113,7 @@ def answer(network: VGGTNetwork, images: Tensor, dtype: torch.dtype = torch.floa
 
 
 def camera_loss(poses: Sequence[Tensor], truth: Tensor) -> Tensor:
-    """Mean over the iterations, each weighted by ``STAGE_DECAY`` to the power of those after it, of L1 errors.
+    """Mean over the iterations of L1 errors, each weighted by ``STAGE_DECAY`` to the power of those after it.
 
     Args:
         poses: encoded poses (…, 9) of the iterations, the best last.
@@ -127,10 +128,11 @@ def camera_loss(poses: Sequence[Tensor], truth: Tensor) -> Tensor:
 
 
 def depth_loss(depth: Tensor, confidence: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
-    """Loss of the depth, c · |d − z| − α log c + ``LOGARITHM`` · |log d − log z|, and c-weighted loss of its gradient.
+    """Loss of the depth, and of its gradient, both weighted by confidence c.
 
-    Both are means over pixels. The gradient's is the mean over ``SCALES`` of c · |Δ(d − z)|, over neighbours that are both known on every
-    1st, 2nd, 4th and 8th pixel, across and down.
+    The first is the mean over pixels of c · |d − z| − α log c + λ · |log d − log z|, with λ = ``LOGARITHM``;
+    the second the mean over ``SCALES`` of c · |Δ(d − z)|, across and down, between neighbours that are both
+    known on every 1st, 2nd, 4th and 8th pixel.
 
     Args:
         depth, confidence, truth: (…, H, W); pixels whose truth is 0 do not count.

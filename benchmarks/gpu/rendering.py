@@ -29,8 +29,7 @@ def rendering(
     command = [sys.executable, "-m", "training.dataset", "--out", str(folder)]
     command += ["--count", str(-(-most // max(1, cores))), "--views", str(views), "--shape", *map(str, shape)]
     running = [
-        subprocess.Popen([*command, "--start", str(1_000_000 * (1 + k))], env=one)
-        for k in range(cores)
+        subprocess.Popen([*command, "--start", str(1_000_000 * (1 + k))], env=one) for k in range(cores)
     ]
     try:
         yield

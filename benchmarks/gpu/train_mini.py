@@ -4,8 +4,8 @@
 
 All processor cores but two render while the GPU trains, so samples grow from run to run. A run takes
 ``--minutes`` in all: it first waits for ``--first`` samples, and resumes where the one before stopped. The
-learning rate follows a clock of ``--schedule`` minutes of training over all runs. ``--work`` keeps the samples
-and the state; ``--out`` gets the weights, the log and the table of errors on samples that were held out.
+learning rate follows a clock of ``--schedule`` minutes of training over all runs. ``--work`` keeps samples and
+state; ``--out`` gets the weights, the log and the table of errors on samples that were held out.
 """
 
 from __future__ import annotations
@@ -98,11 +98,17 @@ def options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--first", type=int, default=1500, help="samples to wait for")
     parser.add_argument("--views", type=int, default=8, help="of each rendered sample")
     parser.add_argument("--cores", type=int, default=max(1, (os.cpu_count() or 1) - 2), help="that render")
-    parser.add_argument("--samples", type=int, default=20_000, help="most that are rendered: 1.1 MB each on the GPU")
-    parser.add_argument("--pixels", type=int, default=0, help="of a batch; 0: for 80 GB; halve it for half of that")
+    parser.add_argument(
+        "--samples", type=int, default=20_000, help="most that are rendered: 1.1 MB each on the GPU"
+    )
+    parser.add_argument(
+        "--pixels", type=int, default=0, help="of a batch; 0: for 80 GB; halve it for half of that"
+    )
     parser.add_argument("--rate", type=float, default=LARGE.rate)
     parser.add_argument("--device", default="cuda")
-    parser.add_argument("--small", action="store_true", help="a tiny network and tiny pictures, to try the script")
+    parser.add_argument(
+        "--small", action="store_true", help="a tiny network and tiny pictures, to try the script"
+    )
     return parser.parse_args(arguments)
 
 
@@ -124,7 +130,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise SystemExit(f"{data}: {have} samples in {args.minutes / 2:g} minutes; give --minutes more")
         left = args.minutes - (time.monotonic() - began) / 60 - min(AT_THE_END, 0.2 * args.minutes)
         config = replace(
-            plain, minutes=args.schedule, stop=max(left, 1e-3), rate=args.rate, pixels=args.pixels or plain.pixels
+            plain,
+            minutes=args.schedule,
+            stop=max(left, 1e-3),
+            rate=args.rate,
+            pixels=args.pixels or plain.pixels,
         )
         trainer = MiniTrainer(config, [*args.data, data], args.work / "run", device=args.device)
         trainer.run(every=200, validation=1000)

@@ -31,7 +31,8 @@ class Contents:
     """What a file of weights says of itself.
 
     Attributes:
-        network: a key of :data:`SIGNATURES`, one of :data:`OWN`, ``sweep`` for the embedded network, or empty: unknown.
+        network: a key of :data:`SIGNATURES`, one of :data:`OWN`, ``sweep`` for the embedded network, or
+            empty: unknown.
         names: of the tensors.
         size: bytes of the file.
     """

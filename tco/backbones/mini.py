@@ -1,8 +1,8 @@
 """``mini``: a VGGT of eight million parameters, which takes images alone and predicts depths and cameras.
 
 The network is :class:`tco.backbones.vggt.VGGTNetwork` with small sizes, patches of 8 pixels, and no head for
-points; nothing of it is published, it is trained in this repository (``training/train_mini.py``). It makes the
-claim of arXiv 2604.03878, on networks that find their own cameras, testable without foreign weights.
+points; nothing of it is published, it is trained in this repository (``training/train_mini.py``). It makes
+the claim of arXiv 2604.03878, on networks that find their own cameras, testable without foreign weights.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ MINI = VGGTConfig(
 )  # fmt: skip
 """Sizes of the network: fewer than 2²³ parameters, 16.8 MB in half precision.
 
-Its encoder is the embedding of patches alone: attention within a view is what the frame blocks have, and those
-can be adapted.
+Its encoder is the embedding of patches alone: attention within a view is what the frame blocks have, and
+those can be adapted.
 """
 
 
