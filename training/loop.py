@@ -109,7 +109,8 @@ class Loop(ABC):
         """Write the averaged weights as the package reads them."""
 
     def _resume(self, path: Path) -> None:
-        state = torch.load(path, map_location=self.device, weights_only=True)
+        # Read on the CPU: the optimiser keeps its step counts there, and would wait for those on a GPU.
+        state = torch.load(path, map_location="cpu", weights_only=True)
         self.net.load_state_dict(state["net"])
         self.mean.load_state_dict(state["mean"])
         self.optimiser.load_state_dict(state["optimiser"])

@@ -3,8 +3,8 @@
 They are those of the paper (Wang et al. 2025, arXiv 2503.11651, section 3.4): the truth is expressed in the
 first camera and scaled so that the points of all views are 1 away from it on average; the prediction is not
 normalised. Where the paper leaves a number open it is that of its authors' training code
-(``training/loss.py`` of github.com/facebookresearch/vggt), which also has L1 in place of the paper's Huber loss
-for cameras.
+(``training/loss.py`` of github.com/facebookresearch/vggt), which also has L1 in place of the paper's Huber
+loss for cameras.
 """
 
 from __future__ import annotations

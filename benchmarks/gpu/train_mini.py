@@ -1,11 +1,11 @@
 """Train the image-only network ``mini`` where a GPU is at hand for some minutes.
 
-    python -m benchmarks.gpu.train_mini [--minutes 9] [--schedule 25]
+    python -m benchmarks.gpu.train_mini [--minutes 8.5] [--schedule 21.5]
 
 All processor cores but two render while the GPU trains, so samples grow from run to run. A run takes
 ``--minutes`` in all: it first waits for ``--first`` samples, and resumes where the one before stopped. The
-learning rate follows a clock of ``--schedule`` minutes of training over all runs. ``--work`` keeps samples and
-state; ``--out`` gets the weights, the log and the table of errors on samples that were held out.
+learning rate follows a clock of ``--schedule`` minutes of training over all runs. ``--work`` keeps samples
+and state; ``--out`` gets the weights, the log and the table of errors on samples that were held out.
 """
 
 from __future__ import annotations
@@ -93,8 +93,8 @@ def options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--work", type=Path, default=Path("runs/gpu/mini"), help="keeps samples and state")
     parser.add_argument("--out", type=Path, default=Path(os.environ.get("OUT", "runs/gpu/out")))
     parser.add_argument("--data", type=Path, nargs="*", default=[], help="more folders of samples")
-    parser.add_argument("--minutes", type=float, default=9.0, help="of this run, in all")
-    parser.add_argument("--schedule", type=float, default=25.0, help="minutes of training in all runs")
+    parser.add_argument("--minutes", type=float, default=8.5, help="of this run, in all")
+    parser.add_argument("--schedule", type=float, default=21.5, help="minutes of training in all runs")
     parser.add_argument("--first", type=int, default=1500, help="samples to wait for")
     parser.add_argument("--views", type=int, default=8, help="of each rendered sample")
     parser.add_argument("--cores", type=int, default=max(1, (os.cpu_count() or 1) - 2), help="that render")
