@@ -20,7 +20,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from benchmarks.backbone import drawn
-from tco.backbones import da3, pi3, vggt
+from tco.backbones import da3, mini, pi3, vggt
 from tco.backbones.base import Backbone
 from tco.lora import LoRAConfig, adapted
 from tco.types import Cameras, Priors, Views
@@ -28,6 +28,7 @@ from tco.types import Cameras, Priors, Views
 NETWORKS: dict[str, tuple[Callable[[Any], nn.Module], Any, Callable[..., Any]]] = {
     "vggt": (vggt.VGGTNetwork, vggt.VGGTConfig.vggt_1b(), vggt.VGGT),
     "pi3": (pi3.Pi3Network, pi3.Pi3Config.large(), pi3.Pi3),
+    "mini": (vggt.VGGTNetwork, mini.MINI, mini.Mini),
     "da3": (da3.DA3Network, da3.DA3Config.base(), da3.DA3),
     "da3-small": (da3.DA3Network, da3.DA3Config.small(), da3.DA3),
 }

@@ -36,11 +36,12 @@ Size = tuple[int, int, int]
 """Views, width and height of the canvas."""
 
 PIPELINE = "pipeline"
-COUNTED = ("vggt", "pi3", "da3", "da3-small")
+COUNTED = ("vggt", "pi3", "mini", "da3", "da3-small")
 FITTED: dict[str, tuple[Size, ...]] = {
     "sweep": ((4, 128, 96), (4, 256, 192), (15, 256, 192), (4, 512, 384), (15, 512, 384)),
     PIPELINE: ((4, 128, 96), (12, 256, 192), (4, 512, 384)),
     **dict.fromkeys(("vggt", "pi3"), ((2, 280, 210), (4, 518, 392), (12, 518, 392))),
+    "mini": ((2, 256, 192), (4, 256, 192), (4, 512, 384)),
     **dict.fromkeys(("da3", "da3-small"), ((2, 84, 56), (5, 84, 56), (2, 168, 126), (4, 168, 126))),
 }
 """What the fits are made of."""
@@ -48,11 +49,12 @@ CHECKED: dict[str, tuple[Size, ...]] = {
     "sweep": ((7, 256, 192), (9, 384, 288), (15, 384, 288), (7, 512, 384)),
     PIPELINE: ((9, 384, 288),),
     **dict.fromkeys(COUNTED, ((3, 140, 98), (2, 280, 210))),
+    "mini": ((3, 136, 96), (2, 280, 208)),
 }
 """What they are checked with."""
 MODES = {"forward": 0, "optimised": 1}
 """Steps; one passes every place that allocates, where the views are tied to each other from the first."""
-POLISH_LOOKS = 3
+POLISH_LOOKS = 1
 """On the depths after them; the first already holds all that the later ones do."""
 COPIES = 1.2
 """Measured over counted bytes of an optimised network's tensors, for VGGT-1B and π³ at the sizes that are

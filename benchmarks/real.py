@@ -25,12 +25,16 @@ SETS = ("kitchen", "office", "livingroom")
 
 @dataclass(frozen=True)
 class RealSet:
-    """Views of one set, what COLMAP knows of them, and the measured depth (V, H, W), 0 where unknown."""
+    """Views of one set, what COLMAP knows of them, and the measured depth (V, H, W), 0 where unknown.
+
+    ``metres`` are those of one unit of depths and cameras.
+    """
 
     name: str
     views: Views
     priors: PriorSet
     truth: Tensor
+    metres: float = 1.0
 
     @property
     def given(self) -> Priors:
@@ -38,8 +42,8 @@ class RealSet:
         return self.priors.optimise
 
 
-def load(name: str, size: int, count: int = 0) -> RealSet:
-    """The first ``count`` views of a set (0: all), their longer sides ``size`` pixels.
+def load(name: str, size: int, count: int = 0, stride: int = 16) -> RealSet:
+    """The first ``count`` views of a set (0: all), longer sides ``size`` pixels, multiples of ``stride``.
 
     Raises:
         SystemExit: the sets are not beside this checkout.
@@ -48,7 +52,7 @@ def load(name: str, size: int, count: int = 0) -> RealSet:
     if not root.is_dir():
         sys.exit(f"{root} is not there: this measurement needs the shared real sets")
     workspace = open_workspace(root)
-    views, _ = make_views(workspace, ViewConfig(max_image_size=size), 16)
+    views, _ = make_views(workspace, ViewConfig(max_image_size=size), stride)
     views = views[: count or len(views)]
     tracks = read_tracks(workspace.model)
     frame = chunk_frame(tracks, views)
@@ -65,7 +69,8 @@ def load(name: str, size: int, count: int = 0) -> RealSet:
         depth = np.zeros((h, w), np.float32)
         depth[inside] = measured[at[inside][:, 1], at[inside][:, 0]]
         truth.append(torch.from_numpy(depth))
-    return RealSet(name, batch(views, frame)[0], build_priors(tracks, views, frame), torch.stack(truth))
+    priors = build_priors(tracks, views, frame)
+    return RealSet(name, batch(views, frame)[0], priors, torch.stack(truth), unit)
 
 
 def within(prediction: Prediction, truth: Tensor, share: float = 0.05) -> float:

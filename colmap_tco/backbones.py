@@ -39,7 +39,8 @@ class NetworkConfig:
     backbone: str = knob(
         "auto",
         "network that predicts the depths. auto: vggt, pi3 or da3 where there is a CUDA device and its "
-        "weights were fetched (colmap-tco weights), else sweep, which is in the package. All but sweep adapt "
+        "weights were fetched (colmap-tco weights), else sweep, which is in the package. mini finds its "
+        "cameras as vggt does and has no weights yet but those one trains. All but sweep adapt "
         "qkv, proj, fc1, fc2 at a rate of 5e-4 where lora_targets and rate are left alone. da3 and da3-small "
         "need the package depth-anything-3 and take the cameras as input",
         choices=("auto", *NETWORKS),

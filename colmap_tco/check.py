@@ -171,6 +171,8 @@ def _need(network: Network, device: torch.device, cameras: Sequence[Pinhole], co
 
 def _state(network: Network, needs: Footprint, pixels: int, free: int) -> str:
     """Whether a network could run now."""
+    if network.training:
+        return f"no weights yet: {network.training}"
     if network.checkpoint is not None and cached(network.checkpoint) is None:
         c = network.checkpoint
         return f"not fetched ({gigabytes(c.size)}, {c.licence}): colmap-tco weights fetch {network.name}"

@@ -60,7 +60,8 @@ class Network:
         loader: ``module:function``, called with the file of weights and ``device=``; gives a
             :class:`tco.backbones.base.Backbone`.
         kind: whose weights it takes, as :func:`tco.backbones.identify.identify` tells.
-        checkpoint: where its weights are published; None if they are in the package.
+        checkpoint: where its weights are published; None if they are in the package, or not made yet.
+        training: how weights are made of which there are none yet; empty for all others.
         image_size: longer side of the images that it was trained with, pixels.
         stride: sides of images are multiples of this.
         tco: settings of :class:`tco.options.TCOConfig` that suit this network, for those which the user
@@ -79,6 +80,7 @@ class Network:
     tco: Mapping[str, Any] = field(default_factory=dict)
     modules: tuple[str, ...] = ()
     install: str = ""
+    training: str = ""
 
     def missing(self) -> tuple[str, ...]:
         """Those of ``modules`` that are not installed; nothing is imported."""
@@ -117,6 +119,18 @@ NETWORKS: dict[str, Network] = {
             checkpoint=None,
             image_size=256,
             stride=16,
+        ),
+        Network(
+            name="mini",
+            title="a small VGGT that finds its cameras, trained in this repository",
+            loader="tco.backbones.mini:load",
+            kind="mini",
+            checkpoint=None,
+            image_size=192,
+            stride=8,
+            tco=_PAPER,
+            training="python -m benchmarks.gpu.train_mini, in a checkout, makes some within half an hour on "
+            "a large GPU (benchmarks/gpu/README.md)",
         ),
         Network(
             name="vggt",

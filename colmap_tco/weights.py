@@ -72,6 +72,8 @@ def weights(action: str, name: str | None, config: WeightsConfig, progress: Prog
 def _published(name: str | None) -> tuple[Network, Checkpoint]:
     if name in PUBLISHED:
         return PUBLISHED[name]
+    if name in NETWORKS and NETWORKS[name].training:
+        raise InputError(none_yet(NETWORKS[name]))
     if name in NETWORKS:
         raise InputError(f"the weights of {name} are in the package: there is nothing to fetch or to verify")
     asked = f"there is no network {name!r}" if name else "name a network"
@@ -84,7 +86,8 @@ def table() -> str:
     for network in NETWORKS.values():
         c = network.checkpoint
         if c is None:
-            rows.append((network.name, "", "Apache-2.0", "", "in the package"))
+            state = f"none yet: {network.training}" if network.training else "in the package"
+            rows.append((network.name, "", "Apache-2.0", "", state))
             continue
         path = cached(c)
         state = str(path) if path else f"not fetched: colmap-tco weights fetch {network.name}"
@@ -119,13 +122,23 @@ def cached(checkpoint: Checkpoint) -> Path | None:
     return None
 
 
+def none_yet(network: Network) -> str:
+    """That a network has no weights to fetch and none in the package, and how to make some."""
+    return (
+        f"no weights of {network.name} are in the package or published yet: {network.training}; then name "
+        "the file with --weights"
+    )
+
+
 def located(network: Network) -> Path:
     """The file of weights of a network on this machine.
 
     Raises:
-        MissingError: it was not fetched; the message says how to.
+        MissingError: it was not fetched, or nobody made it yet; the message says how to.
     """
     checkpoint = network.checkpoint
+    if network.training:
+        raise MissingError(none_yet(network))
     if checkpoint is None:
         from tco.backbones.weights import EMBEDDED
 
@@ -254,6 +267,8 @@ def require(path: Path, network: Network) -> None:
 
 def _expected(network: Network) -> str:
     c = network.checkpoint
+    if network.training:
+        return f"--backbone {network.name} takes what this makes: {network.training}"
     if c is None:
         return "--backbone sweep takes those of the embedded network"
     return f"--backbone {network.name} takes {c.file} of {c.page}, {gigabytes(c.size)}"

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 
-from benchmarks.gpu import network_steps, render_parity
+from benchmarks.gpu import network_steps, render_parity, train_mini
+from benchmarks.gpu.rendering import rendering, wait_for
+from tco.backbones.mini import load as load_mini
+from training.dataset import read, write
 
 
 def cells(line: str) -> list[str]:
@@ -45,3 +50,43 @@ def test_render_parity(capsys: pytest.CaptureFixture[str]) -> None:
     assert gsplat[:2] == ["gsplat", "cpu"] and ("gsplat" in gsplat[2] or "CUDA" in gsplat[2])
     assert pairs[:2] == ["surface_pairs", "surface"]
     assert all(float(cell) < 1e-4 for cell in pairs[2:9])
+
+
+def test_train_mini_resumes_and_tells_its_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two runs, one training; samples are there, so that none are rendered."""
+    write(tmp_path / "work" / "data", 0, 4, (32, 48), 4)
+    words = ["--small", "--device", "cpu", "--cores", "0", "--first", "3", "--minutes", "0.02", "--schedule",
+             "9", "--work", str(tmp_path / "work"), "--out", str(tmp_path / "out")]  # fmt: skip
+    steps = []
+    for _ in range(2):
+        train_mini.main(words)
+        told = capsys.readouterr().out
+        steps.append(int(told.split()[0]))
+        rows = [cells(line) for line in told.splitlines() if line.startswith(("| 2", "| 4"))]
+        assert [r[0] for r in rows] == ["2", "4"]
+        for r in rows:
+            near, far, rotation, direction, *rest = map(float, r[1:])
+            assert 0 <= near <= far <= 1 and 0 < rotation < 180 and 0 <= direction <= 90
+            assert all(0 <= x < 10 for x in rest)
+    assert 0 < steps[0] < steps[1]
+    assert load_mini(tmp_path / "out" / "weights.safetensors").network.config == train_mini.TINY
+    assert (tmp_path / "out" / "table.md").read_text() == told
+    with pytest.raises(SystemExit, match="0 samples in"):
+        train_mini.main([*words[:-4], "--work", str(tmp_path / "none"), "--out", str(tmp_path / "out")])
+
+
+def test_rendering_keeps_what_is_there_and_leaves_no_parts(tmp_path: Path) -> None:
+    """The one sample that is wanted is there: the process ends, and nothing is rendered again."""
+    (tmp_path / "1000000.npz").write_bytes(b"kept")
+    (tmp_path / "1000000.7.part").write_bytes(b"cut off")
+    with rendering(tmp_path, (48, 64), cores=1, views=2, most=1):
+        assert wait_for(tmp_path, 1, minutes=1) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["1000000.npz"]
+    assert (tmp_path / "1000000.npz").read_bytes() == b"kept"
+
+
+@pytest.mark.slow
+def test_rendering_renders(tmp_path: Path) -> None:
+    with rendering(tmp_path, (48, 64), cores=1, views=2, most=2):
+        assert wait_for(tmp_path, 1, minutes=10) >= 1
+    assert read(tmp_path / "1000000.npz").images.shape == (2, 48, 64, 3)

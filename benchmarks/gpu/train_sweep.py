@@ -15,6 +15,8 @@ import sys
 import time
 from pathlib import Path
 
+from benchmarks.gpu.rendering import rendering
+
 EMBEDDED = Path(__file__).resolve().parents[2] / "tco" / "backbones" / "data" / "sweep.safetensors"
 SIZES = {
     "large": [[0.0, 144, 192], [0.25, 192, 256], [0.7, 288, 384]],
@@ -24,22 +26,9 @@ SIZES = {
 
 def render(folder: Path, minutes: float, shape: tuple[int, int]) -> int:
     """Render samples on all cores for some minutes; the number of samples there are."""
-    folder.mkdir(parents=True, exist_ok=True)
     have = len(list(folder.glob("*.npz")))
-    one = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "training.dataset", "--out", str(folder), "--count", "100000"]
-    command += ["--shape", *map(str, shape)]
-    running = [
-        subprocess.Popen([*command, "--start", str(1_000_000 * (1 + k))], env=one)
-        for k in range(os.cpu_count() or 1)
-    ]
-    time.sleep(60 * minutes)
-    for process in running:
-        process.terminate()
-    for process in running:
-        process.wait()
-    for part in folder.glob("*.part"):
-        part.unlink()
+    with rendering(folder, shape, os.cpu_count() or 1):
+        time.sleep(60 * minutes)
     count = len(list(folder.glob("*.npz")))
     sys.stdout.write(f"| samples rendered | {count - have} | in all | {count} |\n")
     return count

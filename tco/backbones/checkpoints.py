@@ -24,6 +24,8 @@ CONFIG = "config"
 
 ZIP = b"PK\x03\x04"
 """Beginning of the files that ``torch.save`` writes."""
+NETWORK = "network"
+"""Key of the network's name in that metadata, where the names of the tensors do not tell."""
 
 
 def load_network(
@@ -111,13 +113,17 @@ def tied(network: nn.Module) -> list[list[str]]:
     return [same for same in names.values() if len(same) > 1]
 
 
-def save(path: Path, network: nn.Module, config: Any) -> None:
-    """Write a network as safetensors, with its sizes (a dataclass) in the metadata; tied names once."""
+def save(path: Path, network: nn.Module, config: Any, info: Mapping[str, str] | None = None) -> None:
+    """Write a network as safetensors, with its sizes (a dataclass) in the metadata; tied names once.
+
+    ``info`` is further metadata, such as :data:`NETWORK`.
+    """
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in network.state_dict().items()}
     for names in tied(network):
         for name in names[1:]:
             del tensors[name]
-    save_file(tensors, path, {"format": "pt", CONFIG: json.dumps(dataclasses.asdict(config))})
+    sizes = json.dumps(dataclasses.asdict(config))
+    save_file(tensors, path, {**(info or {}), "format": "pt", CONFIG: sizes})
 
 
 def read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -12,7 +12,7 @@ from tco.backbones.transformer import Block
 from tco.types import Views
 
 PATCH = 14
-"""Side of a patch in pixels."""
+"""Side of a patch of the published networks in pixels."""
 
 COLOR_MEAN, COLOR_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Statistics of ImageNet that images in [0, 1] are normalised by."""
@@ -27,6 +27,7 @@ class ViTConfig:
         registers: tokens beside the class token and the patches.
         side: patches along a side of the square images that it was trained on.
         mask_token: whether the checkpoint holds the token of masked training, which is never used here.
+        patch: side of a patch in pixels.
     """
 
     channels: int = 1024
@@ -35,6 +36,7 @@ class ViTConfig:
     registers: int = 4
     side: int = 37
     mask_token: bool = True
+    patch: int = PATCH
 
     @classmethod
     def vits14(cls) -> ViTConfig:
@@ -55,11 +57,13 @@ class Patches:
         tokens: (V, rows · columns, C).
         grid: rows and columns of patches.
         valid: (V, H, W) bool, of the canvas.
+        patch: side of a patch in pixels.
     """
 
     tokens: Tensor
     grid: tuple[int, int]
     valid: Tensor
+    patch: int = PATCH
 
     def __len__(self) -> int:
         return int(self.tokens.shape[0])
@@ -67,21 +71,21 @@ class Patches:
     @property
     def size(self) -> tuple[int, int]:
         """(H, W) of the canvas in pixels."""
-        return PATCH * self.grid[0], PATCH * self.grid[1]
+        return self.patch * self.grid[0], self.patch * self.grid[1]
 
 
-def patch_grid(views: Views) -> tuple[int, int]:
-    """Rows and columns of patches.
+def patch_grid(views: Views, patch: int = PATCH) -> tuple[int, int]:
+    """Rows and columns of patches with sides of ``patch`` pixels.
 
     Raises:
         ValueError: the canvas is not divisible into patches.
     """
     height, width = views.size
-    if height % PATCH or width % PATCH or not len(views):
+    if height % patch or width % patch or not len(views):
         raise ValueError(
-            f"{len(views)} views of {width}×{height}: at least one is needed, with sides divisible by {PATCH}"
+            f"{len(views)} views of {width}×{height}: at least one is needed, with sides divisible by {patch}"
         )
-    return height // PATCH, width // PATCH
+    return height // patch, width // patch
 
 
 def normalized(images: Tensor) -> Tensor:
@@ -93,9 +97,9 @@ def normalized(images: Tensor) -> Tensor:
 class PatchEmbed(nn.Module):
     """One linear map of each patch of the image."""
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, patch: int) -> None:
         super().__init__()
-        self.proj = nn.Conv2d(3, channels, PATCH, PATCH)
+        self.proj = nn.Conv2d(3, channels, patch, patch)
 
     def forward(self, images: Tensor) -> Tensor:
         """(V, 3, H, W) → (V, rows · columns, C)."""
@@ -114,7 +118,7 @@ class DINOv2(nn.Module):
         self.register_tokens = nn.Parameter(torch.zeros(1, config.registers, c))
         if config.mask_token:
             self.mask_token = nn.Parameter(torch.zeros(1, c))
-        self.patch_embed = PatchEmbed(c)
+        self.patch_embed = PatchEmbed(c, config.patch)
         self.blocks = nn.ModuleList(Block(c, config.heads, eps=1e-6) for _ in range(config.depth))
         self.norm = nn.LayerNorm(c, 1e-6)
 

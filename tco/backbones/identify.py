@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tco.backbones.checkpoints import CONFIG, read
+from tco.backbones.checkpoints import CONFIG, NETWORK, read
 from tco.backbones.weights import WeightsError
 
 SIGNATURES: dict[str, tuple[str, ...]] = {
@@ -18,6 +18,9 @@ SIGNATURES: dict[str, tuple[str, ...]] = {
     "da3": ("model.backbone.pretrained.", "model.head.", "model.cam_enc.", "model.cam_dec."),
 }
 """Network → beginnings of names that all its checkpoints have, and no other network's have together."""
+
+OWN = ("mini",)
+"""Networks that have the names of a published one and tell themselves apart in the file's metadata."""
 
 _MOST_HEADER = 100_000_000
 """The format allows no longer header."""
@@ -28,7 +31,8 @@ class Contents:
     """What a file of weights says of itself.
 
     Attributes:
-        network: a key of :data:`SIGNATURES`, ``sweep`` for the embedded network, or empty: unknown.
+        network: a key of :data:`SIGNATURES`, one of :data:`OWN`, ``sweep`` for the embedded network, or
+            empty: unknown.
         names: of the tensors.
         size: bytes of the file.
     """
@@ -106,6 +110,8 @@ def _header(path: Path, size: int) -> dict[str, Any] | None:
 
 
 def _network(names: Iterable[str], info: dict[str, str]) -> str:
+    if info.get(NETWORK) in OWN:
+        return info[NETWORK]
     every = list(names)
     for network, parts in SIGNATURES.items():
         if all(any(name.startswith(part) for name in every) for part in parts):

@@ -47,6 +47,7 @@ class VGGTConfig:
         camera_depth, camera_heads: of the trunk of the camera head.
         features, levels: channels of the dense heads, after and before the fusion.
         layers: depths whose tokens the dense heads read; the camera head reads the last depth.
+        points: whether there is a head for points in the world, which nothing here is made of.
     """
 
     encoder: ViTConfig = field(default_factory=ViTConfig.vitl14)
@@ -59,6 +60,7 @@ class VGGTConfig:
     features: int = 256
     levels: tuple[int, int, int, int] = (256, 512, 1024, 1024)
     layers: tuple[int, int, int, int] = (4, 11, 17, 23)
+    points: bool = True
 
     @classmethod
     def vggt_1b(cls) -> VGGTConfig:
@@ -104,7 +106,12 @@ class Aggregator(nn.Module):
         return torch.cat([both[:1], both[1:].expand(views - 1, -1, -1)])
 
     def forward(
-        self, patches: Tensor, grid: tuple[int, int], chosen: Sequence[int], recompute: range = range(0)
+        self,
+        patches: Tensor,
+        grid: tuple[int, int],
+        chosen: Sequence[int],
+        recompute: range = range(0),
+        scenes: int = 1,
     ) -> Features:
         """Aggregate patch tokens.
 
@@ -113,9 +120,11 @@ class Aggregator(nn.Module):
             grid: rows and columns of patches.
             chosen: V' views that the dense heads need.
             recompute: depths whose activations are computed again in the backward pass.
+            scenes: as many scenes of equally many views, one after the other in V; views attend to those
+                of their own scene alone.
         """
-        c, views = self.config, len(patches)
-        x = torch.cat([self.special(views), patches], 1)
+        c, views = self.config, len(patches) // scenes
+        x = torch.cat([self.special(views).repeat(scenes, 1, 1), patches], 1)
         own = rotary(grid, 1 + c.registers, c.channels // c.heads, x.device)
         common = own.repeated(views)
         index = torch.tensor(list(chosen), device=x.device)
@@ -123,27 +132,31 @@ class Aggregator(nn.Module):
         frame = x
         for i in range(c.depth):
             frame = run_block(self.frame_blocks[i], x, own, i in recompute)
-            x = self._over_all(i, frame, common, i in recompute)
+            x = self._over_all(i, frame.unflatten(0, (scenes, views)), common, i in recompute)
             if i in c.layers or i == c.depth - 1:
                 both[i] = torch.cat([frame[index], x[index]], -1)
         dense = tuple(both[i][:, 1 + c.registers :] for i in c.layers)
         return Features(torch.cat([frame[:, 0], x[:, 0]], -1), dense, both[c.depth - 1])
 
     def _over_all(self, i: int, x: Tensor, common: Rotary, recompute: bool) -> Tensor:
-        every = run_block(self.global_blocks[i], x.flatten(0, 1).unsqueeze(0), common, recompute)
-        return every.view_as(x)
+        every = run_block(self.global_blocks[i], x.flatten(1, 2), common, recompute)
+        return every.view(-1, *x.shape[2:])
 
 
 class VGGTNetwork(nn.Module):
-    """The published network without its track head; names and shapes of the state dict are the published."""
+    """The published network without its track head; names and shapes of the state dict are the published.
+
+    Other sizes, other patches and no head for points are for networks of one's own.
+    """
 
     def __init__(self, config: VGGTConfig) -> None:
         super().__init__()
         self.config = c = config
         self.aggregator = Aggregator(c)
         self.camera_head = CameraHead(2 * c.channels, c.camera_heads, c.camera_depth)
-        self.point_head = DPTHead(2 * c.channels, c.features, c.levels, 4)
-        self.depth_head = DPTHead(2 * c.channels, c.features, c.levels, 2)
+        patch = c.encoder.patch
+        self.point_head = DPTHead(2 * c.channels, c.features, c.levels, 4, patch) if c.points else None
+        self.depth_head = DPTHead(2 * c.channels, c.features, c.levels, 2, patch)
 
 
 def products(network: VGGTNetwork) -> list[nn.Module]:
@@ -174,6 +187,7 @@ class VGGT(nn.Module):
         super().__init__()
         self.network, self.dtype, self.recompute = network, dtype, recompute
         store_products(products(network), dtype)
+        self.stride = network.config.encoder.patch
 
     def decoder(self) -> nn.Module:
         """The frame and global blocks."""
@@ -184,12 +198,12 @@ class VGGT(nn.Module):
         """Patch tokens of all views; no prior is used.
 
         Raises:
-            ValueError: no views, or a canvas that is not divisible by 14.
+            ValueError: no views, or a canvas that is not divisible into patches.
         """
-        grid = patch_grid(views)
+        grid = patch_grid(views, self.stride)
         with computing(views.images.device, self.dtype):
             tokens = self.network.aggregator.patch_embed(normalized(views.images), grid)
-        return Patches(tokens, grid, views.valid)
+        return Patches(tokens, grid, views.valid, self.stride)
 
     def with_points(self, encoded: Patches, points: Mapping[int, SparseDepth]) -> Patches:
         """The same features: this network takes no points."""
@@ -212,7 +226,13 @@ class VGGT(nn.Module):
         return Prediction(depth, confidence, cameras(pose, encoded.size), chosen)
 
     def points(self, encoded: Patches, views: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Points (V', H, W, 3) in the world of the first view, and their confidence (V', H, W)."""
+        """Points (V', H, W, 3) in the world of the first view, and their confidence (V', H, W).
+
+        Raises:
+            ValueError: the network has no head for points.
+        """
+        if self.network.point_head is None:
+            raise ValueError(f"{self.name} has no head for points")
         features = self.features(encoded, views)
         with computing(encoded.tokens.device, torch.float32):
             return points_of(self.network.point_head(features.dense, encoded.grid))

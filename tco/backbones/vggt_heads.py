@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from tco.backbones.dinov2 import PATCH
 from tco.backbones.transformer import Block, Mlp
-from tco.geometry import invert, matrix_from_quat, rigid
+from tco.geometry import invert, matrix_from_quat, quat_from_matrix, rigid
 from tco.types import Cameras
 
 POSE_CHANNELS = 9
@@ -38,26 +38,29 @@ class CameraHead(nn.Module):
         self.pose_branch = Mlp(channels, channels // 2, POSE_CHANNELS)
 
     def forward(self, tokens: Tensor, iterations: int = 4) -> list[Tensor]:
-        """Camera tokens (V, C) → encoded poses (V, 9) after every iteration, the best last."""
-        tokens = self.token_norm(tokens).unsqueeze(0)
+        """Camera tokens (…, V, C) → encoded poses (…, V, 9) after every iteration, the best last."""
+        shape = (*tokens.shape[:-1], POSE_CHANNELS)
+        tokens = self.token_norm(tokens).reshape(-1, *tokens.shape[-2:])
         plain = F.layer_norm(tokens, tokens.shape[-1:], eps=1e-6)
         poses: list[Tensor] = []
-        pose = self.empty_pose_tokens.expand(1, tokens.shape[1], -1)
+        pose = self.empty_pose_tokens.expand(*tokens.shape[:2], -1)
         for k in range(iterations):
-            shift, scale, gate = self.poseLN_modulation(self.embed_pose(pose.detach())).chunk(3, -1)
+            shift, scale, gate = self.poseLN_modulation(self.embed_pose(pose.detach() if k else pose)).chunk(
+                3, -1
+            )
             x = tokens + gate * (plain * (1 + scale) + shift)
             for block in self.trunk:
                 x = block(x)
             change = self.pose_branch(self.trunk_norm(x))
             pose = change if k == 0 else pose + change
-            poses.append(torch.cat([pose[0, :, :7], F.relu(pose[0, :, 7:])], -1))
+            poses.append(torch.cat([pose[..., :7], F.relu(pose[..., 7:])], -1).view(shape))
         return poses
 
 
 def cam_from_world(pose: Tensor) -> Tensor:
-    """Extrinsics (V, 4, 4) of encoded poses (V, 9)."""
-    x, y, z, w = pose[:, 3:7].unbind(-1)
-    return rigid(matrix_from_quat(torch.stack([w, x, y, z], -1)), pose[:, :3])
+    """Extrinsics (…, 4, 4) of encoded poses (…, 9)."""
+    x, y, z, w = pose[..., 3:7].unbind(-1)
+    return rigid(matrix_from_quat(torch.stack([w, x, y, z], -1)), pose[..., :3])
 
 
 def cameras(pose: Tensor, size: tuple[int, int]) -> Cameras:
@@ -68,6 +71,25 @@ def cameras(pose: Tensor, size: tuple[int, int]) -> Cameras:
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
     rows = [fx, zero, 0.5 * width * one, zero, fy, 0.5 * height * one, zero, zero, one]
     return Cameras(invert(cam_from_world(pose)), torch.stack(rows, -1).reshape(-1, 3, 3))
+
+
+def encoded(made: Cameras, size: tuple[int, int]) -> Tensor:
+    """Encoded poses (…, 9) of cameras (…, 4, 4) and (…, 3, 3), the inverse of :func:`cameras`.
+
+    The quaternion is the one of positive real part: of the two that mean a rotation, the one which a network
+    is trained to give. Only the focal lengths of the intrinsics count.
+
+    Args:
+        made: cameras whose principal points are in the middle of the canvas.
+        size: (H, W) of the canvas.
+    """
+    height, width = size
+    pose = invert(made.world_from_cam)
+    w, x, y, z = quat_from_matrix(pose[..., :3, :3]).unbind(-1)
+    turn = torch.stack([x, y, z, w], -1) * torch.where(w < 0, -1.0, 1.0).unsqueeze(-1)
+    focal = torch.stack([made.K[..., 1, 1], made.K[..., 0, 0]], -1)
+    angle = 2 * (0.5 * focal.new_tensor([height, width]) / focal).atan()
+    return torch.cat([pose[..., :3, 3], turn, angle], -1)
 
 
 def ramp(count: int, extent: float, channels: int, device: torch.device) -> Tensor:
@@ -166,10 +188,13 @@ class Scratch(nn.Module):
 
 
 class DPTHead(nn.Module):
-    """Dense maps from the tokens of four layers of the aggregator."""
+    """Dense maps from the tokens of four layers of the aggregator, for patches of ``patch`` pixels."""
 
-    def __init__(self, channels: int, features: int, levels: Sequence[int], out: int) -> None:
+    def __init__(
+        self, channels: int, features: int, levels: Sequence[int], out: int, patch: int = PATCH
+    ) -> None:
         super().__init__()
+        self.patch = patch
         a, b, _, d = levels
         self.norm = nn.LayerNorm(channels)
         self.projects = nn.ModuleList(nn.Conv2d(channels, c, 1) for c in levels)
@@ -190,7 +215,7 @@ class DPTHead(nn.Module):
 
     def some(self, tokens: Sequence[Tensor], grid: tuple[int, int]) -> Tensor:
         """As ``forward``, for a few views, all at once."""
-        size = (PATCH * grid[0], PATCH * grid[1])
+        size = (self.patch * grid[0], self.patch * grid[1])
         levels = []
         for x, project, resize in zip(tokens, self.projects, self.resize_layers, strict=True):
             maps = self.norm(x).transpose(1, 2).unflatten(2, grid)

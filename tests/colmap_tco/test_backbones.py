@@ -17,7 +17,7 @@ from colmap_tco.errors import MissingError
 from colmap_tco.published import NETWORKS, PUBLISHED
 from colmap_tco.weights import _note_accepted, cached
 from tco.backbones.base import Backbone
-from tco.backbones.checkpoints import save
+from tco.backbones.checkpoints import NETWORK, save
 from tco.backbones.da3 import INSTALL, DA3Config, DA3Network
 from tco.backbones.dinov2 import ViTConfig
 from tco.backbones.pi3 import Pi3Config, Pi3Network
@@ -25,6 +25,7 @@ from tco.backbones.vggt import VGGTConfig, VGGTNetwork
 from tco.backbones.weights import EMBEDDED
 from tco.options import TCOConfig
 from tests.tco.published import TINY_DA3
+from tests.tco.test_mini import TINY as TINY_MINI
 
 VIT = ViTConfig(channels=48, depth=1, heads=2)
 CLASSES: dict[type, type[torch.nn.Module]] = {
@@ -36,6 +37,7 @@ TINY = {
     "vggt": VGGTConfig(VIT, 48, 4, 2, 4, 1, 2, 8, (8, 8, 8, 8), (0, 1, 2, 3)),
     "pi3": Pi3Config(ViTConfig(48, 1, 2, mask_token=False), 48, 4, 2, 5, 48, 1, 2, 32),
     "da3": TINY_DA3,
+    "mini": TINY_MINI,
 }
 
 
@@ -54,7 +56,7 @@ def written(path: Path, kind: str) -> Path:
         pytest.skip(f"not installed: {', '.join(missing)}")
     torch.manual_seed(0)
     config = TINY[kind]
-    save(path, CLASSES[type(config)](config), config)
+    save(path, CLASSES[type(config)](config), config, {NETWORK: kind} if kind == "mini" else None)
     return path
 
 
@@ -100,6 +102,12 @@ def test_a_network_that_was_not_fetched_says_how_to(name: str) -> None:
         select(NetworkConfig(backbone=name, device="cpu"))
 
 
+def test_a_network_without_weights_says_how_to_make_them() -> None:
+    told = "no weights of mini are in the package .* benchmarks.gpu.train_mini, .*--weights"
+    with pytest.raises(MissingError, match=told):
+        select(NetworkConfig(backbone="mini", device="cpu"))
+
+
 def fetched(folder: Path, name: str) -> Path:
     """A file of the published size, empty but for its length, where the hub's cache would have it."""
     c = PUBLISHED[name][1]
@@ -138,8 +146,8 @@ def test_a_file_of_weights_runs_the_network_that_it_is_of(tmp_path: Path, kind: 
     network = load(chosen)
     assert isinstance(network, Backbone)
     assert (network.stride, network.uses_cameras) == (chosen.network.stride, False)
-    licence = "Apache-2.0: commercial use allowed" if kind == "da3" else "CC BY-NC 4.0: no commercial use"
-    assert str(chosen.describe()["licence"]).startswith(licence)
+    licences = {"da3": "Apache-2.0: commercial use allowed", "mini": "None"}
+    assert str(chosen.describe()["licence"]).startswith(licences.get(kind, "CC BY-NC 4.0: no commercial use"))
 
 
 @pytest.mark.parametrize("name", ["da3", "da3-small"])
@@ -174,7 +182,7 @@ def test_the_registry_agrees_with_the_networks(tmp_path: Path) -> None:
     for name, network in NETWORKS.items():
         if network.missing():
             continue
-        path = EMBEDDED if network.checkpoint is None else written(tmp_path / name, network.kind)
+        path = EMBEDDED if name == "sweep" else written(tmp_path / name, network.kind)
         backbone = load(Selected(network, path, torch.device("cpu"), ""))
         assert backbone.stride == network.stride and backbone.name == network.kind
         config = suited(TCOConfig(), network)

@@ -37,6 +37,7 @@ def test_every_network_is_told_with_its_need_and_its_state(room: Room) -> None:
     states = {need.network.name: need.state for need in found.needs}
     assert states["sweep"] == "ready"
     assert states["vggt"] == "not fetched (5.0 GB, CC BY-NC 4.0): colmap-tco weights fetch vggt"
+    assert states["mini"].startswith("no weights yet: python -m benchmarks.gpu.train_mini")
     text = found.summary()
     assert "7 images registered in " in text and "densify would run on cpu" in text
     assert "densify would run sweep (auto: no weights" in text

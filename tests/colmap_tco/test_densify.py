@@ -382,7 +382,7 @@ def test_other_settings_of_the_fusion_keep_the_depth_maps(fresh_room: Room) -> N
     assert anew.report["points"] == second.report["points"]
 
 
-@pytest.mark.parametrize("kind", ["vggt", "pi3", "da3"])
+@pytest.mark.parametrize("kind", ["vggt", "pi3", "da3", "mini"])
 def test_networks_that_predict_cameras_run_through(fresh_room: Room, tmp_path: Path, kind: str) -> None:
     """With random weights: every file is there, in COLMAP's cameras, and nobody is told that it is good."""
     from tests.colmap_tco.test_backbones import written
@@ -403,17 +403,18 @@ def test_networks_that_predict_cameras_run_through(fresh_room: Room, tmp_path: P
             "vggt": "CC BY-NC 4.0: no commercial use; for that there is vggt-commercial",
             "pi3": "CC BY-NC 4.0: no commercial use",
             "da3": "Apache-2.0: commercial use allowed",
+            "mini": None,
         }[kind]
     )
     assert report["settings"]["tco"]["lora_targets"] == ["qkv", "proj", "fc1", "fc2"]
     (chunk,) = report["chunks"]
     assert chunk["agreement"].keys() == {"rotation_degrees", "centre"} and chunk["reduced"] is False
     assert {"own_rotation", "own_translation", "own_focal"} <= report["loss"][0][0].keys()
-    theirs = poses(fresh_room.root / "sparse" / "0")
+    theirs, sides = poses(fresh_room.root / "sparse" / "0"), (56, 64) if kind == "mini" else (56, 70)
     for name, pose in poses(dense / "sparse").items():
         np.testing.assert_allclose(pose, theirs[name], atol=1e-9)
         depth = read_map(dense / "stereo" / "depth_maps" / f"{name}.geometric.bin")
-        assert depth.shape == (56, 70) and (depth > 0).all()
+        assert depth.shape == sides and (depth > 0).all()
 
 
 def test_out_of_memory_leads_to_smaller_chunks(fresh_room: Room) -> None:

@@ -229,6 +229,7 @@ def test_the_list_names_repositories_sizes_and_licences(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     lines = {line.split()[0]: line for line in done.stdout.splitlines() if line}
     assert "in the package" in lines["sweep"]
+    assert "none yet: python -m benchmarks.gpu.train_mini" in lines["mini"]
     for name, (_, checkpoint) in PUBLISHED.items():
         line = next(line for line in done.stdout.splitlines() if line.startswith(f"{name} "))
         assert checkpoint.repository in line and checkpoint.licence in line
@@ -258,6 +259,11 @@ def test_the_list_tells_how_to_install_what_a_network_runs_from(monkeypatch: pyt
         (("fetch", "da3"), 5, "licensed Apache-2.0: commercial use allowed"),
         (("fetch", "vggd"), 3, "there is no network 'vggd'"),
         (("fetch", "sweep"), 3, "in the package"),
+        (
+            ("fetch", "mini"),
+            3,
+            "no weights of mini are in the package or published yet: python -m benchmarks",
+        ),
         (("steal", "vggt"), 2, "invalid choice: 'steal'"),
         (("verify", "vggt", "--weights", "none.safetensors"), 5, "none.safetensors: no such file"),
     ],

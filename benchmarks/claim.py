@@ -1,0 +1,190 @@
+"""The paper's claim at our scale: what each prior and the compatibility of views bring a network.
+
+    python -m benchmarks.claim [--backbone sweep] [--seeds 3] [--output docs/claim.md]
+    python -m benchmarks.claim --backbone mini --weights runs/gpu/out/weights.safetensors
+
+The claim (arXiv 2604.03878): held to what is known of the cameras and to its own views' agreement for some
+steps at test time, a network reconstructs better than it does alone. Rows are those of ``colmap-tco bench``
+(``colmap_tco/bench/rows.py``), run by the same code, on the shared real sets. A network that predicts cameras
+runs all of them, with the settings of the paper's scripts for 7-Scenes, Kinect sequences of rooms as these
+sets are. One that takes cameras as input cannot do without them: its first row is the network alone with both
+priors, and its settings are those of ``densify``.
+
+Columns: ``d5``, share of the measured pixels whose depth is within 5 % after one scale for all views, the
+median ratio; ``acc`` and ``comp``, means of the distances of points to the sensor's and back, millimetres,
+after the paper's alignment; ``AUC``, of relative poses at 30° against COLMAP's, where a network finds them.
+A ± is half of the 95 % interval of the mean over seeds (Student's t).
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.real import RealSet, arguments, load, publish
+from colmap_tco.backbones import NetworkConfig, Selected, select, suited
+from colmap_tco.backbones import load as load_network
+from colmap_tco.bench.command import TAKE_CAMERAS
+from colmap_tco.bench.figures import point_figures
+from colmap_tco.bench.methods import Reconstruction, check_row, reconstruct
+from colmap_tco.bench.prepare import Prepared
+from colmap_tco.bench.rows import Row, parse_rows
+from colmap_tco.bench.schedules import published
+from colmap_tco.errors import DensifyError
+from colmap_tco.evaluation.trajectory import pose_auc
+from colmap_tco.published import NETWORKS
+from tco.backbones.base import Backbone
+from tco.options import TCOConfig
+
+BOTH = ("pose", "intrinsics")
+CURVE = ("steps=5", "steps=10", "steps=20", "steps=80")
+ROWS = {
+    False: ("base", "pose", "intrinsics", "tco", "no-compatibility", *CURVE),
+    True: ("steps=0", "tco", "no-compatibility", *CURVE),
+}
+"""Whether a network takes cameras as input → its rows, the network alone first."""
+
+Figures = Mapping[str, float]
+
+
+def prepared(real: RealSet) -> Prepared:
+    """A set as the rows take it; the truth in metres, COLMAP's cameras as truth and as priors."""
+    cameras = real.given.cameras
+    assert cameras is not None
+    poses = cameras.world_from_cam.double().numpy().copy()
+    poses[:, :3, 3] *= real.metres
+    truth = (real.truth * real.metres).numpy()
+    return Prepared(real.views, cameras, poses, cameras.K.double().numpy(), truth, real.metres, real.given)
+
+
+def figures(made: Reconstruction, scene: Prepared, own_cameras: bool) -> Figures:
+    """The columns of one run.
+
+    Raises:
+        InputError: its points cannot be aligned to the truth.
+    """
+    R, centre = made.world_from_cam[:, :3, :3], made.world_from_cam[:, :3, 3]
+    depth = np.einsum("vhwc,vc->vhw", made.points - centre[:, None, None], R[:, :, 2])
+    known = scene.known
+    ratio = scene.depth[known] / np.maximum(depth[known], 1e-9)
+    error = np.abs(np.median(ratio) / ratio - 1)
+    cloud = point_figures(made.points, scene.points, known, per_metre=1000.0)
+    found = {"d5": float((error < 0.05).mean()), "acc": cloud["acc_mean"], "comp": cloud["comp_mean"]}
+    if own_cameras:
+        (found["AUC"],) = pose_auc(made.world_from_cam, scene.world_from_cam, (30,)).auc
+    return found
+
+
+def interval(values: Sequence[float]) -> tuple[float, float]:
+    """Mean, and half the width of its 95 % interval by Student's t; not a number for a single value."""
+    from scipy.stats import t
+
+    n = len(values)
+    if n < 2:
+        return float(np.mean(values)), math.nan
+    return float(np.mean(values)), float(t.ppf(0.975, n - 1) * np.std(values, ddof=1) / math.sqrt(n))
+
+
+def cell(values: Sequence[float], digits: int) -> str:
+    """Mean ± half of the interval; one value alone has no interval."""
+    mean, half = interval(values)
+    return f"{mean:.{digits}f}" + ("" if math.isnan(half) else f" ± {half:.{digits}f}")
+
+
+def line(row: str, runs: Sequence[Sequence[Figures]], base: Sequence[Sequence[Figures]]) -> str:
+    """A row of the table.
+
+    Args:
+        row: its name.
+        runs: figures of each set and seed.
+        base: those of the network alone.
+    """
+    parts = []
+    for of_set in runs:
+        digits = {"d5": 3, "AUC": 3, "acc": 1, "comp": 1}
+        parts += [cell([run[name] for run in of_set], digits[name]) for name in of_set[0]]
+    each = zip(*runs, strict=True), zip(*base, strict=True)
+    gains = [
+        float(np.mean([a["d5"] - b["d5"] for a, b in zip(ours, alone, strict=True)]))
+        for ours, alone in zip(*each, strict=True)
+    ]
+    return f"| {row} | " + " | ".join(parts) + f" | {cell(gains, 3)} |"
+
+
+def measured(network: Backbone, scene: Prepared, row: Row, config: TCOConfig, seeds: int) -> list[Figures]:
+    """Figures of a row on a set, one a seed; without steps nothing is drawn, and one run stands for all."""
+    device = next(network.decoder().parameters()).device
+    fixed = row.config(config).steps == 0
+    found = [
+        figures(reconstruct(network, scene, row, config, device, seed), scene, not network.uses_cameras)
+        for seed in range(1 if fixed else seeds)
+    ]
+    return found * seeds if fixed else found
+
+
+def settings(chosen: Selected) -> TCOConfig:
+    """Of the optimisation before rows change them."""
+    if chosen.network.kind in TAKE_CAMERAS:
+        return suited(TCOConfig(), chosen.network)
+    return published("7scenes", TCOConfig())
+
+
+def options() -> argparse.Namespace:
+    """Command line."""
+    parser = arguments(__doc__ or "")
+    parser.set_defaults(steps=0)
+    parser.add_argument("--backbone", default="sweep", choices=list(NETWORKS))
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--rows", nargs="+", default=None, help="as colmap-tco bench has them; first: alone")
+    return parser.parse_args()
+
+
+def table(
+    network: Backbone, sets: Sequence[RealSet], rows: Sequence[Row], config: TCOConfig, seeds: int
+) -> list[str]:
+    """Lines of the table; the first row is what gains are counted from."""
+    scenes = [prepared(real) for real in sets]
+    columns = ("d5", "acc", "comp") + (() if network.uses_cameras else ("AUC",))
+    head = " | ".join(f"{real.name} {column}" for real in sets for column in columns)
+    lines = [f"| | {head} | gain in d5 |", "|---" * (2 + len(sets) * len(columns)) + "|"]
+    base: list[list[Figures]] = []
+    for row in rows:
+        runs = [measured(network, scene, row, config, seeds) for scene in scenes]
+        base = base or runs
+        lines.append(line(row.name, runs, base))
+    return lines
+
+
+def main() -> None:
+    """Measure and publish."""
+    args = options()
+    weights = str(args.weights) if args.weights else ""
+    try:
+        chosen = select(NetworkConfig(backbone=args.backbone, weights=weights, device=args.device))
+        network = load_network(chosen)
+        config = settings(chosen)
+        if args.steps:
+            config = replace(config, steps=args.steps)
+        rows = parse_rows(args.rows or ROWS[network.uses_cameras], BOTH)
+        for row in rows:
+            check_row(network, row)
+        sets = [load(name, args.size, args.views, network.stride) for name in args.sets]
+        lines = table(network, sets, rows, config, args.seeds)
+    except DensifyError as error:
+        raise SystemExit(str(error)) from error
+    about = (
+        f"# What priors and compatibility bring {args.backbone}\n\n`python -m benchmarks.claim`: weights "
+        f"{Path(chosen.weights).name}, {args.views or 'all'} views of {args.size} pixels, {config.steps} "
+        f"steps at {config.rate:g} where a row does not say otherwise, {args.seeds} seeds.\n\n"
+    )
+    publish(about + "\n".join(lines) + "\n", args.output)
+
+
+if __name__ == "__main__":
+    main()
