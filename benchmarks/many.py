@@ -4,9 +4,9 @@
 
 The pictures are of a flight over the ``hills`` of ``benchmarks/rendered.py``, in lines as a drone flies them,
 with the same distance between pictures whatever their number. The model has the true cameras; its points are
-corners of the pictures, seen by some of the views that could see them, with keypoints off by half a pixel. Each
-run is a process of its own. Seconds are of the processor, over all threads, so that other work on the machine
-does not count; ``a view`` divides their sum by the number of views.
+corners of the pictures, seen by some of the views that could see them, with keypoints off by half a pixel.
+Each run is a process of its own. Seconds are of the processor, over all threads, so that other work on the
+machine does not count; ``a view`` divides their sum by the number of views.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from training.scenes import Sample
 Floats = NDArray[np.float64]
 SHAPE = (360, 480)
 SPACING, HEIGHT, AHEAD = 0.5, 4.6, 1.2
-"""Between pictures, above the lowest ground, and how far before the camera it looks, in units of the scene."""
+"""Between pictures, above the lowest ground, and how far ahead of it the camera looks, in its units."""
 CORNERS = 250
 """Corners of each picture that become points, where three views or more see them."""
 REACH = 2.2

@@ -115,7 +115,7 @@ def knots() -> tuple[list, list[Floats]]:
 def traced(
     bodies: list, poses: list[Floats], scale: float, shape: tuple[int, int] = SHAPE, fine: int = 2
 ) -> Sample:
-    """Pictures (h, w) of the bodies, each of another material, from cameras world_from_cam, lit by sun and sky.
+    """Pictures (h, w) of bodies, each of another material, from cameras world_from_cam, lit by sun and sky.
 
     Colours are the mean of ``fine`` × ``fine`` rays a pixel, depths are those of its centre.
     """

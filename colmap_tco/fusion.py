@@ -14,7 +14,7 @@ grow with the number of views. The result does not depend on the number of threa
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -44,15 +44,21 @@ class EmptyCloudError(DensifyError):
         self.cloud, self.report = cloud, report
 
 
-def fuse(views: Sequence[FusionView], config: FusionConfig | None = None) -> tuple[Cloud, FusionReport]:
-    """Fuse all views into one cloud; see :func:`fuse_views`.
+def fuse(
+    views: Sequence[FusionView], config: FusionConfig | None = None, fused: Callable[[], None] = lambda: None
+) -> tuple[Cloud, FusionReport]:
+    """Fuse all views into one cloud; see :func:`fuse_views`. ``fused`` is called after each view.
 
     Raises:
         EmptyCloudError: no point is left; the message names the filter that removed most.
     """
     config = config or FusionConfig()
     report = FusionReport()
-    cloud = join(fuse_views(views, config, report))
+    parts = []
+    for part in fuse_views(views, config, report):
+        parts.append(part)
+        fused()
+    cloud = join(parts)
     kept = thin(cloud.points, config.voxel_size, config.max_points)
     if len(kept) < len(cloud):
         report.thin(kept)

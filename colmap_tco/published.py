@@ -67,6 +67,8 @@ class Network:
             left at their defaults.
         modules: what it imports that is not among this package's requirements.
         install: the command that brings them.
+        most_views: of a chunk. Where all views attend to each other, seconds grow with the square of their
+            number; where each looks at its nearest ones, larger chunks predict fewer views twice.
     """
 
     name: str
@@ -79,6 +81,7 @@ class Network:
     tco: Mapping[str, Any] = field(default_factory=dict)
     modules: tuple[str, ...] = ()
     install: str = ""
+    most_views: int = 40
 
     def missing(self) -> tuple[str, ...]:
         """Those of ``modules`` that are not installed; nothing is imported."""
@@ -117,6 +120,7 @@ NETWORKS: dict[str, Network] = {
             checkpoint=None,
             image_size=256,
             stride=16,
+            most_views=128,
         ),
         Network(
             name="vggt",

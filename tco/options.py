@@ -56,7 +56,11 @@ class PolishConfig:
     polish_rate: float = knob(
         3e-3, "learning rate of the logarithms of the depths' factors (Adam); lower it if surfaces get rough"
     )
-    polish_sources: int = knob(2, "views whose depths each of these steps looks at")
+    polish_sources: int = knob(
+        0,
+        "views whose depths each of these steps looks at; 0: an eighth of the views, at least 2, so that each "
+        "comes equally often however many there are",
+    )
     polish_smoothness: float = knob(
         0.1,
         "weight of the mean difference between the logarithms of the factors of neighbouring pixels, less "
@@ -77,10 +81,16 @@ class PolishConfig:
     )
 
     def __post_init__(self) -> None:
-        if self.polish_steps < 0 or self.polish_sources < 1 or not self.polish_levels:
-            raise ValueError("polish_steps must not be negative, and there must be a source and a level")
+        if self.polish_steps < 0 or self.polish_sources < 0 or not self.polish_levels:
+            raise ValueError(
+                "polish_steps and polish_sources must not be negative, and there must be a level"
+            )
         if self.polish_smoothness < 0 or self.polish_consistency < 0:
             raise ValueError("polish_smoothness and polish_consistency are weights, not negative")
+
+    def sources(self, views: int) -> int:
+        """Views that a step looks at, of so many whose depths are asked for."""
+        return self.polish_sources or max(2, round(views / 8))
 
 
 @dataclass(frozen=True)

@@ -90,7 +90,7 @@ def polish(
     report: Callable[[int, dict[str, float]], None] | None = None,
     watched: Sequence[SparseDepth] = (),
 ) -> Polished:
-    """Refine the depths of all V views; confidences stay.
+    """Refine the depths of all V views but those that only help; confidences stay.
 
     Args:
         prediction: of all views.
@@ -104,7 +104,10 @@ def polish(
     c, every = config.polish, range(len(prediction.depth))
     field = DepthField(prediction.depth, c.polish_levels)
     optimiser = torch.optim.Adam(field.parameters(), c.polish_rate)
-    sources = Sources("epoch", terms.overlap, generator)
+    sources, count = (
+        Sources("epoch", terms.overlap, generator, terms.views.helpers),
+        c.sources(len(terms.views.wanted)),
+    )
     weights = _weights(terms, config)
     edges = picture_edges(terms.views.images)
 
@@ -120,7 +123,7 @@ def polish(
         if part:
             # One source after the other, so that only one rendering is in memory.
             loss = torch.stack([weights[name] * value for name, value in part.items()]).sum()
-            (loss / c.polish_sources).backward()
+            (loss / count).backward()
             found["loss"] = loss.detach()
         if watched and len(watched[source]):
             found["held_out"] = errors_at(mine.depth[0].detach(), watched[source]).abs().median()
@@ -134,7 +137,7 @@ def polish(
         optimiser.zero_grad(set_to_none=True)
         with torch.no_grad():
             now = _refined(prediction, field, every)
-        parts = means([gradients(source, now) for source in sources.draw(c.polish_sources)])
+        parts = means([gradients(source, now) for source in sources.draw(count)])
         figures = {"loss": 0.0} | {name: float(value) for name, value in parts.items()}
         if _finite(field, figures["loss"]):
             optimiser.step()
