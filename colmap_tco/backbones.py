@@ -53,8 +53,8 @@ class NetworkConfig:
     )
     chunk_size: int = knob(
         0,
-        "views that are optimised together; 0: as many as fit 70 % of the free memory, at most 128 with sweep "
-        "and 40 with the others",
+        "views that are optimised together; 0: as many as fit 70 % of the free memory, at most 128 with "
+        "sweep and 40 with the others",
     )
 
 

@@ -16,8 +16,8 @@ from colmap_tco._pycolmap import Floats, Ints, Mask
 from colmap_tco.tracks import Covisibility
 
 CONTEXT_SHARE, SHARE_MEASURED_AT = 0.3, 40
-"""Share of a chunk's views that are context, when a scene needs more than one chunk of up to so many views. What
-lies around a group of views grows with its rim: the share falls with the square root of its size."""
+"""Share of a chunk's views that are context, when a scene needs more than one chunk, and the size up to which
+it holds. What lies around a group is as long as its rim: beyond, the share falls with the square root."""
 
 
 @dataclass(frozen=True)

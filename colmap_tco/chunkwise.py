@@ -73,7 +73,7 @@ def predict_chunks(
             (backbone, device), scene.tracks, scene.views, chunk, settings, pace.step, pictures
         )
 
-    with _progress_told(result, len(scene.views)):
+    with progress_told(result, len(scene.views)):
         for attempt in within_memory(
             todo, scene.pairs.common, work, budget.views_now, lambda: release(device)
         ):
@@ -96,7 +96,7 @@ def predict_chunks(
 
 
 @contextmanager
-def _progress_told(result: Result, views: int) -> Iterator[None]:
+def progress_told(result: Result, views: int) -> Iterator[None]:
     """Say at an interruption what is there already, so that nobody begins anew."""
     try:
         yield

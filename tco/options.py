@@ -58,8 +58,8 @@ class PolishConfig:
     )
     polish_sources: int = knob(
         0,
-        "views whose depths each of these steps looks at; 0: an eighth of the views, at least 2, so that each "
-        "comes equally often however many there are",
+        "views whose depths each of these steps looks at; 0: an eighth of the views, at least 2, so that "
+        "each comes equally often however many there are",
     )
     polish_smoothness: float = knob(
         0.1,

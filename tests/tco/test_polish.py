@@ -208,3 +208,21 @@ def test_it_follows_the_steps_on_the_network(scene: Wall) -> None:
     none = optimize(Toy(), scene.views, scene.priors, replace(config, steps=0))
     assert none.history == [] and replace(config, steps=0).all_steps == 0
     assert config.reference_schedule().all_steps == 2
+
+
+@pytest.mark.parametrize("views", [2, 15, 16, 40, 100])
+def test_each_view_comes_as_often_however_many_there_are(views: int) -> None:
+    config = PolishConfig()
+    visits = config.polish_steps * config.sources(views) / views
+    assert visits == pytest.approx(5, abs=0.6) or views < 15
+    assert PolishConfig(polish_sources=3).sources(views) == 3
+
+
+def test_views_that_only_help_stay_as_they_are(scene: Wall) -> None:
+    """The others are refined all the same."""
+    wrong = predicted(scene, bump(scene, 0.04))
+    helped = replace(scene, views=replace(scene.views, helpers=2))
+    got = refined(helped, wrong)
+    assert torch.equal(got.depth[2:], wrong.depth[2:])
+    error, before = ((p.depth / scene.depth - 1).abs()[:2].mean() for p in (got, wrong))
+    assert error < 0.7 * before
