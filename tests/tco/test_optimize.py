@@ -20,6 +20,7 @@ from tco.backbones.weights import load_sweep
 from tco.optimize import Outcome, errors_at_points, optimize
 from tco.options import PolishConfig, TCOConfig
 from tco.penalties import sparse_depth
+from tco.toy import Toy, wall
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
 
 Scene = tuple[Views, Priors, Tensor]
