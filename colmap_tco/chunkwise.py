@@ -106,9 +106,10 @@ def progress_told(result: Result, views: int) -> Iterator[None]:
         raise
 
 
-ENCODING, STEP, POLISHING = 1.0, 5.0, 0.4
-"""What one view takes to be encoded, one step on the network and one on the depths, measured for ``sweep`` in
-the seconds that one view takes to be decoded. They decide where the bar stands within a chunk, no more."""
+ENCODING, STEP, POLISHING = 1.0, 10.0, 0.8
+"""What it takes to encode one view, to take one step on the network, and to look at one view in a step on the
+depths, in the seconds that decoding one view takes; measured for ``sweep`` (``python -m benchmarks.many``). They
+decide where the bar stands within a chunk, no more."""
 
 
 class Pace:
@@ -117,17 +118,18 @@ class Pace:
     def __init__(self, chunk: Chunk, config: TCOConfig, progress: Progress) -> None:
         """Count from where the progress is now."""
         self._progress, self._begin, self._owned = progress, progress.done, len(chunk.owned)
-        self._first, self._last = (1 + ENCODING) * len(chunk.views), len(chunk.views)
+        self._first, self._last = (1 + ENCODING) * len(chunk.views), len(chunk.owned)
         self._steps, self._count = config.steps, 0
-        polishing = POLISHING * config.polish.polish_steps
-        self._total = self._first + STEP * config.steps + self._last + polishing
+        self._polishing = POLISHING * config.polish.sources(len(chunk.owned))
+        network = self._first + STEP * config.steps + self._last
+        self._total = network + self._polishing * config.polish.polish_steps
 
     def step(self, terms: Mapping[str, float]) -> None:
         """One step is done, on the network or, after all of these, on the depths."""
         self._count += 1
         work = self._first + STEP * min(self._count, self._steps)
         if self._count > self._steps:
-            work += self._last + POLISHING * (self._count - self._steps)
+            work += self._last + self._polishing * (self._count - self._steps)
         # What remains of a chunk, the writing of its maps, is hardly anything.
         done = self._begin + self._owned * min(1.0, work / self._total)
         self._progress.reach(done, **{name: terms[name] for name in SHOWN if name in terms})
