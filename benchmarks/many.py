@@ -40,7 +40,7 @@ CORNERS = 250
 REACH = 2.2
 """Distance of camera centres at which the chance that both find the same corner has fallen to 1 / e."""
 KEYPOINT_NOISE = 0.5
-STAGES = ("workspace", "optimisation", "fusion", "page")
+STAGES = ("workspace", "optimisation", "fusion", "report")
 
 
 def flight(views: int) -> list[Floats]:

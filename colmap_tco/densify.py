@@ -185,6 +185,7 @@ def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified
         "device": str(chosen.device),
         "seconds": clock.seconds,
     }
+    progress.stage("report", 1)
     outputs.write_report(result.paths.report, figures)
     if config.report_page:
         write_page(result.paths, json.loads(result.paths.report.read_text("utf-8")))
@@ -195,7 +196,7 @@ def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified
 HASHED = 200_000_000
 """Bytes below which a file of weights counts by its content, above by its size and time of change."""
 
-STAGES = {"workspace": 2.0, "optimisation": 80.0, "fusion": 18.0}
+STAGES = {"workspace": 3.0, "optimisation": 82.0, "fusion": 11.0, "report": 4.0}
 """Stages of a run and about how much of its time each takes."""
 
 
