@@ -4,7 +4,7 @@ Each view in turn is the reference. A pixel of it becomes a point if enough neig
 its depth, moved into the neighbour, meets the surface that the neighbour's depth and normal describe
 there (``max_depth_error``), that surface point falls back onto the pixel (``max_reproj_error``), and
 the two normals agree (``max_normal_error``). The point is the confidence-weighted mean of the agreeing
-surfaces, its colour the median of their full-resolution images, and the pixels of the other views
+surfaces, its colour the median of their images, and the pixels of the other views
 that it was made of are not used as references again.
 
 Views are loaded when they are needed and kept while they fit ``cache_size``, so that memory does not

@@ -203,7 +203,8 @@ def sampling(view: View) -> Iterator[Band]:
     for rows, pixels in _bands(view):
         trusted = cells[rows.start // CELL : -(-rows.stop // CELL)].repeat(CELL, 0).repeat(CELL, 1)
         with np.errstate(invalid="ignore"):
-            inside: Mask = ((pixels >= 0) & (pixels <= _pycolmap.camera_size(view.original))).all(-1)
+            within = (pixels >= 0) & (pixels <= _pycolmap.camera_size(view.original))
+        inside: Mask = np.logical_and(within[..., 0], within[..., 1])
         yield Band(rows, *_for_opencv(pixels), inside & trusted[: len(inside), : inside.shape[1]])
 
 

@@ -24,6 +24,7 @@ from colmap_tco.normals import normals_from_depth
 from colmap_tco.outputs import (
     ViewMaps,
     fusion_views,
+    no_finer,
     plain,
     read_view,
     undistorted_model,
@@ -498,3 +499,17 @@ def test_reports_are_plain_json(tmp_path: Path) -> None:
     }
     with pytest.raises(TypeError, match="object"):
         plain({"a": object()})
+
+
+@pytest.mark.parametrize(("size", "expected"), [((750, 1000), (375, 500)), ((399, 1600), (399, 1600))])
+def test_large_images_are_fused_at_less_than_their_size(
+    size: tuple[int, int], expected: tuple[int, int]
+) -> None:
+    """They keep their field of view: what lies at a share of the sides lies there still."""
+    y, x = ((np.arange(n) + 0.5) / n for n in size)
+    ramp = np.stack(np.broadcast_arrays(240 * y[:, None], 240 * x, 120.0), -1).round().astype(np.uint8)
+    got = no_finer(ramp, (75, 100))
+    assert got.shape == (*expected, 3)
+    y, x = ((np.arange(n) + 0.5) / n for n in expected)
+    assert np.abs(got[..., 0] - 240 * y[:, None]).max() < 1.1
+    assert np.abs(got[..., 1] - 240 * x).max() < 1.1
