@@ -34,7 +34,7 @@ class Outcome:
     """What optimisation gives.
 
     Attributes:
-        prediction: of all views; those that only help (``Views.helpers``) as the network had them at first.
+        prediction: of all views; those that only help (``Views.helpers``) as the steps knew them.
         cameras: of all views, with their corrections.
         corrections: how far each camera went (``CameraCorrections.sizes``); empty if none could move.
         history: the named terms of every step, unweighted, and their weighted sum as ``loss``; first the
