@@ -112,16 +112,21 @@ def knots() -> tuple[list, list[Floats]]:
     return [*bodies, beads], [look_at(eye, np.array([0, 0.15, 0.35])) for eye in eyes]
 
 
-def traced(bodies: list, poses: list[Floats], scale: float) -> Sample:
-    """Pictures of the bodies, each of another material, from cameras world_from_cam, lit by sun and sky."""
+def traced(
+    bodies: list, poses: list[Floats], scale: float, shape: tuple[int, int] = SHAPE, fine: int = 2
+) -> Sample:
+    """Pictures (h, w) of bodies, each of another material, from cameras world_from_cam, lit by sun and sky.
+
+    Colours are the mean of ``fine`` × ``fine`` rays a pixel, depths are those of its centre.
+    """
     import open3d as o3d
 
-    scene, (h, w) = o3d.t.geometry.RaycastingScene(), SHAPE
+    scene, (h, w) = o3d.t.geometry.RaycastingScene(), shape
     for body in bodies:
         scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(body))
     K = np.array([[0.8 * w, 0, w / 2], [0, 0.8 * w, h / 2], [0, 0, 1]])
-    u, v = np.meshgrid(np.arange(2 * w) / 2 + 0.25, np.arange(2 * h) / 2 + 0.25)
-    fine = np.stack([u, v, np.ones_like(u)], -1).reshape(-1, 3) @ np.linalg.inv(K).T
+    u, v = np.meshgrid((np.arange(fine * w) + 0.5) / fine, (np.arange(fine * h) + 0.5) / fine)
+    dense = np.stack([u, v, np.ones_like(u)], -1).reshape(-1, 3) @ np.linalg.inv(K).T
     u, v = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
     middle = np.stack([u, v, np.ones_like(u)], -1).reshape(-1, 3) @ np.linalg.inv(K).T
     sun = np.array([-0.4, -0.5, 0.77])
@@ -130,7 +135,7 @@ def traced(bodies: list, poses: list[Floats], scale: float) -> Sample:
         rotation, eye = pose[:3, :3], pose[:3, 3]
         hit = _cast(scene, eye, middle @ rotation.T)
         depths.append(np.where(np.isfinite(hit["t_hit"]), hit["t_hit"], 0).reshape(h, w))
-        rays = fine @ rotation.T
+        rays = dense @ rotation.T
         hit = _cast(scene, eye, rays)
         seen = np.isfinite(hit["t_hit"])
         points = eye + np.where(seen, hit["t_hit"], 0)[:, None] * rays
@@ -141,7 +146,7 @@ def traced(bodies: list, poses: list[Floats], scale: float) -> Sample:
         lit = _cast(scene, points + 2e-3 * sun, np.broadcast_to(sun, points.shape))["t_hit"]
         facing = np.abs(hit["primitive_normals"] @ sun) * ~np.isfinite(lit)
         color[seen] *= (0.45 + 0.75 * facing)[seen, None]
-        picture = color.reshape(h, 2, w, 2, 3).mean((1, 3)) ** (1 / 2.2)
+        picture = color.reshape(h, fine, w, fine, 3).mean((1, 3)) ** (1 / 2.2)
         picture = 235 * np.clip(picture * rng.uniform(0.9, 1.05), 0, 1) + rng.normal(0, 2, (h, w, 3))
         images.append(np.clip(picture, 0, 255).astype(np.uint8))
     cams = np.stack([np.linalg.inv(p) for p in poses]).astype(np.float32)

@@ -73,6 +73,8 @@ class Shelf:
         self._limit = config.cache_size * 1e9
         self._held: OrderedDict[int, ShelfView] = OrderedDict()
         self._bytes = 0
+        self._largest = 0
+        """Bytes of the views that are held, and of the largest that was."""
         self._in_use: set[int] = set()
         self._taken: dict[int, NDArray[np.uint8]] = {}
         """One bit a pixel of the views that are not held."""
@@ -84,6 +86,7 @@ class Shelf:
             view = self._prepare(position)
             self._held[position] = view
             self._bytes += view.nbytes
+            self._largest = max(self._largest, view.nbytes)
             self._shrink()
             self.loads += 1
             self.peak_bytes = max(self.peak_bytes, self._bytes)
@@ -102,30 +105,22 @@ class Shelf:
         run: list[tuple[int, ShelfView]] = []
         try:
             self._in_use = {reference}
-            self.get(reference)
+            own = used = self.get(reference).nbytes
             for number, other in enumerate(others):
-                if run and not self._one_more():
+                if run and used + self._largest > self._limit:
                     yield run
-                    run, self._in_use = [], {reference}
+                    run, used, self._in_use = [], own, {reference}
                 self._in_use.add(other)
                 run.append((number, self.get(other)))
+                used += run[-1][1].nbytes
             if run:
                 yield run
         finally:
             self._in_use = set()
 
-    def _one_more(self) -> bool:
-        """Whether another view, as large as the largest held, fits beside those in use."""
-        used = sum(self._held[position].nbytes for position in self._in_use)
-        return used + self._largest() <= self._limit
-
-    def _largest(self) -> int:
-        return max((view.nbytes for view in self._held.values()), default=0)
-
     def _make_room(self) -> None:
-        """Drop views as if the next were as large as the largest held, to keep the limit while reading."""
-        expected = self._largest()
-        while len(self._held) > 1 and self._bytes + expected > self._limit and self._drop_oldest():
+        """Drop views as if the next were as large as the largest so far, to keep the limit while reading."""
+        while len(self._held) > 1 and self._bytes + self._largest > self._limit and self._drop_oldest():
             pass
 
     def _shrink(self) -> None:

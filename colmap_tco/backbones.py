@@ -53,7 +53,9 @@ class NetworkConfig:
         "auto", "auto: cuda if there is one, else cpu; or any name that torch knows, such as cuda:1"
     )
     chunk_size: int = knob(
-        0, "views that are optimised together; 0: as many as fit 70 % of the free memory, at most 40"
+        0,
+        "views that are optimised together; 0: as many as fit 70 % of the free memory, at most 128 with "
+        "sweep and 40 with the others",
     )
 
 
@@ -92,24 +94,27 @@ class Budget:
         pixels: of the canvas.
         device: whose memory counts.
         given: what the user asked for; 0: nothing.
+        most: views of a chunk of this network.
     """
 
     needs: Footprint
     pixels: int
     device: torch.device
     given: int
+    most: int
 
     @classmethod
     def of(cls, chosen: Selected, views: Sequence[View], config: NetworkConfig, steps: int) -> Budget:
         """For these views, and so many steps of optimisation."""
         needs = footprint(chosen.network.name, chosen.device.type, steps)
-        return cls(needs, canvas_pixels(views), chosen.device, config.chunk_size)
+        most = chosen.network.most_views
+        return cls(needs, canvas_pixels(views), chosen.device, config.chunk_size, most)
 
     def views(self) -> int:
         """Views a chunk to plan with."""
         if self.given:
             return max(FEWEST_VIEWS, self.given)
-        return chunk_limit(self.needs, self.pixels, free_memory(self.device))
+        return chunk_limit(self.needs, self.pixels, free_memory(self.device), self.most)
 
     def views_now(self) -> int:
         """Views that fit at this moment, without the reserve of planning; what was asked for, if so."""

@@ -163,7 +163,7 @@ def _need(network: Network, device: torch.device, cameras: Sequence[Pinhole], co
     canvas = max(w for w, _ in canvases), max(h for _, h in canvases)
     pixels, free = canvas[0] * canvas[1], free_memory(device)
     needs, given = footprint(network.name, device.type, config.tco.steps), config.network.chunk_size
-    limit = max(FEWEST_VIEWS, given) if given else chunk_limit(needs, pixels, free)
+    limit = max(FEWEST_VIEWS, given) if given else chunk_limit(needs, pixels, free, network.most_views)
     chunk = min(limit, len(cameras))
     state = _state(network, needs, pixels, free)
     return Need(network, canvas, chunk, needs.bytes(chunk, pixels), bool(needs.measured), state)

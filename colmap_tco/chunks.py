@@ -15,8 +15,9 @@ import numpy as np
 from colmap_tco._pycolmap import Floats, Ints, Mask
 from colmap_tco.tracks import Covisibility
 
-CONTEXT_SHARE = 0.3
-"""Share of a chunk's views that are context, when a scene needs more than one chunk."""
+CONTEXT_SHARE, SHARE_MEASURED_AT = 0.3, 40
+"""Share of a chunk's views that are context, when a scene needs more than one chunk, and the size up to which
+it holds. What lies around a group is as long as its rim: beyond, the share falls with the square root."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,8 @@ def smaller(chunk: Chunk, common: Ints, max_views: int) -> list[Chunk]:
 
 def _cut(common: Ints, members: list[int], max_views: int) -> list[Chunk]:
     """Chunks of at most ``max_views``, context included, that own these views."""
-    room = max_views - max(1, round(max_views * CONTEXT_SHARE))
+    share = CONTEXT_SHARE * min(1.0, math.sqrt(SHARE_MEASURED_AT / max_views))
+    room = max_views - max(1, round(max_views * share))
     groups = _merge(_grow(common, members, room), common, (room + max_views) // 2)
     return [Chunk(tuple(sorted(group)), _context(common, group, max_views)) for group in groups]
 

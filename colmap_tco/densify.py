@@ -18,18 +18,16 @@ from typing import Any, NoReturn
 import numpy as np
 
 from colmap_tco import outputs, report
-from colmap_tco.attempts import within_memory
-from colmap_tco.backbones import Budget, NetworkConfig, Selected, load, select, suited
-from colmap_tco.chunks import Chunk, ChunkPlan, plan_chunks, source_views
+from colmap_tco.backbones import Budget, NetworkConfig, Selected, select, suited
+from colmap_tco.chunks import plan_chunks, source_views
+from colmap_tco.chunkwise import Means, Scene, predict_chunks
 from colmap_tco.errors import InputError, OutOfMemoryError, PartlyDoneError
-from colmap_tco.fill import Existing, FillConfig, fill, open_existing
+from colmap_tco.fill import Existing, FillConfig, open_existing
 from colmap_tco.flags import given_flags
 from colmap_tco.fusion import EmptyCloudError, FusionConfig, fuse
 from colmap_tco.lock import locked
 from colmap_tco.mapping import MappingConfig, ensure_model
-from colmap_tco.memory import release
 from colmap_tco.page.write import write_page
-from colmap_tco.predict import ChunkResult, predict_chunk
 from colmap_tco.priors import PriorConfig, with_points
 from colmap_tco.progress import Progress
 from colmap_tco.resume import Result, fingerprint, open_result
@@ -153,17 +151,18 @@ def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified
         views, blind = with_points(tracks, views, config.priors, config.seed)
         pairs = covisibility(tracks, [view.image_id for view in views])
         budget = Budget.of(chosen, views, config.network, config.tco.steps)
-        plan = plan_chunks(pairs.common, budget.views())
         existing = _existing(config, views)
         key, maps = _fingerprints(workspace, views, config, chosen, existing)
         result = open_result(root, key, config.overwrite, maps, outputs.plain(config))
     if result.finished:
         return Densified(result.paths.root, json.loads(result.paths.report.read_text("utf-8")), fresh=False)
+    plan = plan_chunks(pairs.common, result.chunk_size(budget.views()))
     alone = {views[i].name: why for i, why in plan.skipped.items()}
     skipped = {**workspace.skipped, **skipped, **blind, **alone}
     with clock("optimisation"), _threads(config.num_threads):
-        run = (chosen, budget, existing)
-        failed = _predict(result, tracks, views, pairs, plan, config, run, progress)
+        means = Means(chosen, budget, existing)
+        settings = (config.priors, config.tco, config.seed)
+        failed = predict_chunks(result, Scene(tracks, views, pairs), plan, means, settings, progress)
     used = _used(result, views, config.refine_cameras)
     if not used:
         _nothing_used(skipped, failed)
@@ -189,6 +188,7 @@ def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified
         "device": str(chosen.device),
         "seconds": clock.seconds,
     }
+    progress.stage("report", 1)
     outputs.write_report(result.paths.report, figures)
     if config.report_page:
         write_page(result.paths, json.loads(result.paths.report.read_text("utf-8")))
@@ -196,13 +196,10 @@ def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified
     return Densified(folder, json.loads((folder / "report.json").read_text("utf-8")), fresh=True)
 
 
-SHOWN = ("loss", "held_out")
-"""Terms of a step that are shown while it runs."""
-
 HASHED = 200_000_000
 """Bytes below which a file of weights counts by its content, above by its size and time of change."""
 
-STAGES = {"workspace": 2.0, "optimisation": 80.0, "fusion": 18.0}
+STAGES = {"workspace": 3.0, "optimisation": 82.0, "fusion": 11.0, "report": 4.0}
 """Stages of a run and about how much of its time each takes."""
 
 
@@ -272,48 +269,6 @@ def _fingerprints(
     return key(kept), key(mapped)
 
 
-def _predict(
-    result: Result, tracks: Tracks, views: Sequence[View], pairs: Covisibility, plan: ChunkPlan,
-    config: DensifyConfig, run: tuple[Selected, Budget, Existing | None], progress: Progress,
-) -> dict[str, str]:  # fmt: skip
-    """Optimise the chunks that are not finished yet and write the maps of their views.
-
-    Returns:
-        Name → why a view could not be predicted.
-    """
-    chosen, budget, existing = run
-    todo = [c for c in plan.chunks if not all(result.is_done(views[i].name) for i in c.owned)]
-    progress.stage("optimisation", sum(config.tco.all_steps(len(c.views)) + len(c.owned) for c in todo))
-    if not todo:
-        return {}
-    backbone, failed = load(chosen), {}
-
-    def work(chunk: Chunk) -> ChunkResult:
-        settings = (config.priors, config.tco, config.seed)
-        return predict_chunk(
-            (backbone, chosen.device), tracks, views, chunk, settings,
-            lambda terms: progress.advance(1, **{k: terms[k] for k in SHOWN if k in terms}),
-            lambda view, image: outputs.write_image(result.paths.image(view.name), image),
-        )  # fmt: skip
-
-    for attempt in within_memory(todo, pairs.common, work, budget.views_now, lambda: release(chosen.device)):
-        owned = [views[i] for i in attempt.chunk.owned]
-        if attempt.result is None:
-            failed.update({view.name: attempt.why for view in owned})
-            continue
-        _write_chunk(result, owned, attempt.result, existing, progress)
-        result.mark_chunk(
-            {
-                "views": [views[i].name for i in attempt.chunk.views],
-                "owned": len(owned),
-                "reduced": attempt.chunk not in plan.chunks,
-                "agreement": attempt.result.agreement,
-                "loss": outputs.plain(attempt.result.history),
-            }
-        )
-    return failed
-
-
 def _existing(config: DensifyConfig, views: Sequence[View]) -> Existing | None:
     """The PatchMatch result to complete, if any."""
     if config.fill.fill_only and config.refine_cameras:
@@ -321,29 +276,6 @@ def _existing(config: DensifyConfig, views: Sequence[View]) -> Existing | None:
             "--fill_only keeps depths of COLMAP's cameras, --refine_cameras moves these: give one of the two"
         )
     return open_existing(config.fill, views)
-
-
-def _write_chunk(
-    result: Result,
-    owned: Sequence[View],
-    done: ChunkResult,
-    existing: Existing | None,
-    progress: Progress,
-) -> None:
-    """Write the maps of a chunk's own views, and record them as done."""
-    for view in owned:
-        r = done.views[view.name]
-        maps, filled = fill(existing, view, r.maps) if existing else (r.maps, {})
-        outputs.write_maps(result.paths, view.name, maps)
-        camera = r.corrected.camera
-        # Rounded like the figures of the report, a camera in map coordinates would be metres off.
-        exact = {
-            "cam_from_world": r.corrected.cam_from_world.tolist(),
-            "focal": [camera.fx, camera.fy],
-        }
-        figures: Any = outputs.plain({**r.figures, **filled})
-        result.mark_done(view.name, {**figures, **exact})
-        progress.advance(1)
 
 
 def _nothing_used(skipped: Mapping[str, str], failed: Mapping[str, str]) -> NoReturn:
@@ -378,7 +310,7 @@ def _fuse_and_write(
 ) -> dict[str, Any]:  # fmt: skip
     """Model, lists and cloud; returns their figures for the report."""
     pairs, tracks = seen
-    progress.stage("fusion", 1)
+    progress.stage("fusion", len(used))
     names = [view.name for view in views]
     sources = source_views(pairs, config.fusion.check_num_images)
     neighbours = {names[i]: [names[j] for j in sources[i]] for i in range(len(names))}
@@ -389,11 +321,9 @@ def _fuse_and_write(
     why = None
     try:
         reach = outputs.reaches(tracks, used)
-        cloud, fused = fuse(
-            outputs.fusion_views(result.paths, used, neighbours, indices, reach), config.fusion
-        )
+        shelf = outputs.fusion_views(result.paths, used, neighbours, indices, reach)
+        cloud, fused = fuse(shelf, config.fusion, progress.advance)
     except EmptyCloudError as error:  # the depth maps are there all the same
         cloud, fused, why = error.cloud, error.report, str(error)
     outputs.write_cloud(result.paths, cloud)
-    progress.advance(1)
     return {"points": len(cloud), "no_points": why, "fusion": fused.as_dict()}

@@ -4,7 +4,7 @@ Each view in turn is the reference. A pixel of it becomes a point if enough neig
 its depth, moved into the neighbour, meets the surface that the neighbour's depth and normal describe
 there (``max_depth_error``), that surface point falls back onto the pixel (``max_reproj_error``), and
 the two normals agree (``max_normal_error``). The point is the confidence-weighted mean of the agreeing
-surfaces, its colour the median of their full-resolution images, and the pixels of the other views
+surfaces, its colour the median of their images, and the pixels of the other views
 that it was made of are not used as references again.
 
 Views are loaded when they are needed and kept while they fit ``cache_size``, so that memory does not
@@ -14,7 +14,7 @@ grow with the number of views. The result does not depend on the number of threa
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -44,15 +44,21 @@ class EmptyCloudError(DensifyError):
         self.cloud, self.report = cloud, report
 
 
-def fuse(views: Sequence[FusionView], config: FusionConfig | None = None) -> tuple[Cloud, FusionReport]:
-    """Fuse all views into one cloud; see :func:`fuse_views`.
+def fuse(
+    views: Sequence[FusionView], config: FusionConfig | None = None, fused: Callable[[], None] = lambda: None
+) -> tuple[Cloud, FusionReport]:
+    """Fuse all views into one cloud; see :func:`fuse_views`. ``fused`` is called after each view.
 
     Raises:
         EmptyCloudError: no point is left; the message names the filter that removed most.
     """
     config = config or FusionConfig()
     report = FusionReport()
-    cloud = join(fuse_views(views, config, report))
+    parts = []
+    for part in fuse_views(views, config, report):
+        parts.append(part)
+        fused()
+    cloud = join(parts)
     kept = thin(cloud.points, config.voxel_size, config.max_points)
     if len(kept) < len(cloud):
         report.thin(kept)

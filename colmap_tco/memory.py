@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 SHARE = 0.7
 """Part of the free memory that a chunk may fill: other programs want some, and peaks vary."""
-MOST_VIEWS, FEWEST_VIEWS = 40, 2
-"""Views of a chunk: more do not help each other, and one has nothing to be compared with."""
+FEWEST_VIEWS = 2
+"""Views of a chunk: one alone has nothing to be compared with."""
 
 PIPELINE = "pipeline"
 """Everything but the network, in the table of what was measured."""
@@ -90,10 +90,10 @@ def _products(device: str) -> str:
     return str(compute_dtype(torch.device(device))).removeprefix("torch.")
 
 
-def chunk_limit(needs: Footprint, pixels: int, free: int) -> int:
-    """Views a chunk on a canvas of so many pixels where so many bytes are free, from 2 to 40."""
+def chunk_limit(needs: Footprint, pixels: int, free: int, most: int) -> int:
+    """Views a chunk on a canvas of so many pixels where so many bytes are free, from 2 to ``most``."""
     fitting = needs.views(pixels, SHARE * free)
-    return int(min(max(fitting, FEWEST_VIEWS), MOST_VIEWS))
+    return int(min(max(fitting, FEWEST_VIEWS), most))
 
 
 def canvas_pixels(views: Sequence[View]) -> int:

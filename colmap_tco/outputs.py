@@ -29,6 +29,7 @@ from colmap_tco.views import View, map_mask, undistorted_image
 from colmap_tco.workspace import DensePaths, read_image
 
 JPEG_QUALITY = 95
+COLOUR_DETAIL = 4
 _DIGITS = 6
 _FEWEST_POINTS, _NEARLY_ALL = 10, 0.98
 """Points of a view below which their depths bound nothing, and the share that shall lie before the bound."""
@@ -203,8 +204,27 @@ def fusion_views(
 
 
 def _masked(maps: FusionMaps, view: View) -> FusionMaps:
-    """The maps with the mask of the view, so that what it excludes counts under its own name."""
-    return replace(maps, mask=map_mask(view, maps.depth.shape))
+    """The maps with the mask of the view, so that what it excludes counts under its own name.
+
+    The image is made as small as its colours allow: a point stands for a pixel of the maps.
+    """
+    image = no_finer(maps.image, maps.depth.shape)
+    return replace(maps, image=image, mask=map_mask(view, maps.depth.shape))
+
+
+def no_finer(image: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """An image (H, W, 3) with at least four pixels along each pixel of a map (h, w), means of its own.
+
+    Of large photos few fit the memory, and fusion would read each of them again and again. A point stands for
+    a whole pixel of the map, so that it needs no finer colours.
+    """
+    import cv2
+
+    factor = min(image.shape[0] // (COLOUR_DETAIL * shape[0]), image.shape[1] // (COLOUR_DETAIL * shape[1]))
+    if factor < 2:
+        return image
+    size = (image.shape[1] // factor, image.shape[0] // factor)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def reaches(tracks: Tracks, views: Sequence[View]) -> dict[str, float]:

@@ -14,7 +14,7 @@ from colmap_tco.normals import normals_from_depth
 from colmap_tco.outputs import ViewMaps
 from colmap_tco.priors import PriorConfig, build_priors, check_projection, chunk_frame
 from colmap_tco.tracks import Tracks
-from colmap_tco.views import Take, View, batch, crop
+from colmap_tco.views import Picture, View, batch, crop, network_image
 from tco.options import TCOConfig
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def predict_chunk(
     chunk: Chunk,
     settings: tuple[PriorConfig, TCOConfig, int],
     report: Callable[[dict[str, float]], None],
-    take: Take | None = None,
+    picture: Callable[[View], Picture] = network_image,
 ) -> ChunkResult:
     """Optimise one chunk and give the results of the views that it owns.
 
@@ -77,7 +77,7 @@ def predict_chunk(
         chunk: owned and context views.
         settings: of priors and optimisation, and the seed.
         report: called with the terms of each step.
-        take: is given each view that the chunk owns, and its undistorted image.
+        picture: makes the picture of a view for the network.
 
     Raises:
         InputError: the points do not project where the keypoints are, or an image cannot be read.
@@ -89,10 +89,7 @@ def predict_chunk(
     aligned = None if backbone.uses_cameras else KnownCameras(backbone)
     members = [views[i] for i in chunk.views]
     frame = chunk_frame(tracks, members)
-    owned = {members[i].name for i in range(len(chunk.owned))}
-    images, cameras = batch(
-        members, frame, lambda view, image: take(view, image) if take and view.name in owned else None
-    )
+    images, cameras = batch(members, frame, picture, len(chunk.context))
     check = check_projection(tracks, members, frame, cameras)
     priors = build_priors(tracks, members, frame, prior_config, seed)
     outcome = optimize(

@@ -18,6 +18,9 @@ _BAR = "{desc} {percentage:3.0f}%|{bar}| {elapsed}{postfix}"
 _TOO_EARLY = 0.2
 """Share of a run below which its time so far, with imports and compilation, says nothing of the rest."""
 
+_TOO_LITTLE = 0.02
+"""Share of a stage below which its pace says nothing of the rest."""
+
 
 class Progress:
     """Progress of a whole run, which is a sequence of stages.
@@ -36,10 +39,10 @@ class Progress:
         self._finished = 0.0
         self._names: list[str] = []
         self._total = 0
-        self._done = 0
+        self._done = 0.0
         self._values: dict[str, float] = {}
         self._run_start = self._stage_start = self._last_line = time.monotonic()
-        self._first = (self._stage_start, 0)
+        self._first = (self._stage_start, 0.0)
         self._bar = _open_bar() if bar else None
 
     def plan(self, shares: Mapping[str, float]) -> None:
@@ -66,9 +69,9 @@ class Progress:
         if self._names:
             self._finished += self._shares.get(self._names[-1], 0.0)
         self._names.append(name)
-        self._total, self._done, self._values = total, 0, {}
+        self._total, self._done, self._values = total, 0.0, {}
         self._stage_start = time.monotonic()
-        self._first = (self._stage_start, 0)
+        self._first = (self._stage_start, 0.0)
         self._report(begins=True)
 
     def advance(self, n: int = 1, **values: float) -> None:
@@ -77,13 +80,26 @@ class Progress:
         Raises:
             RuntimeError: no stage has begun.
         """
+        self.reach(self._done + n, **values)
+
+    def reach(self, done: float, **values: float) -> None:
+        """Set how many steps of the stage are done, parts of one too; ``values`` as for :meth:`advance`.
+
+        Raises:
+            RuntimeError: no stage has begun.
+        """
         if not self._names:
-            raise RuntimeError("advance() counts the steps of a stage: call stage() first")
+            raise RuntimeError("reach() and advance() count the steps of a stage: call stage() first")
         if not self._done:
-            self._first = (time.monotonic(), n)  # what compiles or loads does so in the first step
-        self._done += n
+            self._first = (time.monotonic(), done)  # what compiles or loads does so in the first step
+        self._done = done
         self._values.update(values)
         self._report(begins=False)
+
+    @property
+    def done(self) -> float:
+        """Steps of the stage that are done."""
+        return self._done
 
     @property
     def fraction(self) -> float:
@@ -99,7 +115,10 @@ class Progress:
         """Estimate for the run (for the stage, where there is no plan); None while nothing tells."""
         now = time.monotonic()
         since, counted = self._first
-        if self._done <= counted or not counted:
+        if self._done < 2 * counted:
+            # The first step, which loads and compiles, is still most of what there is to go by.
+            since, counted = self._stage_start, 0.0
+        if not self._done or self._done - counted < _TOO_LITTLE * self._total:
             start = self._run_start if self._shares else self._stage_start
             return remaining(now - start, self.fraction) if self.fraction >= _TOO_EARLY else None
         left = (now - since) / (self._done - counted) * max(0, self._total - self._done)
@@ -132,7 +151,7 @@ class Progress:
     def _draw(self, bar: tqdm[Any], begins: bool) -> None:
         if begins and not self._shares:
             bar.reset()
-        counted = f" {self._done}/{self._total}" if self._total > 1 else ""
+        counted = f" {self._done:.0f}/{self._total}" if self._total > 1 else ""
         bar.set_description_str(self._names[-1] + counted, refresh=False)
         left = self.seconds_left
         told = [] if left is None else [f"about {clock(left)} left"]
@@ -147,13 +166,13 @@ class Progress:
         left = self.seconds_left
         data: dict[str, Any] = {
             "stage": self._names[-1],
-            "done": self._done,
+            "done": round(self._done, 2),
             "total": self._total,
             "fraction": round(self.fraction, 4),
             "seconds_left": None if left is None else round(left),
             "values": dict(self._values),
         }
-        parts = [self._names[-1] + (f" {self._done}/{self._total}" if self._total > 1 else "")]
+        parts = [self._names[-1] + (f" {self._done:.0f}/{self._total}" if self._total > 1 else "")]
         parts += [f"{name} {value:.4g}" for name, value in self._values.items()]
         parts += [] if left is None else [f"about {clock(left)} left"]
         logger.info(", ".join(parts), extra={"data": data})

@@ -68,6 +68,8 @@ class Network:
             left at their defaults.
         modules: what it imports that is not among this package's requirements.
         install: the command that brings them.
+        most_views: of a chunk. Where all views attend to each other, seconds grow with the square of their
+            number; where each looks at its nearest ones, larger chunks predict fewer views twice.
     """
 
     name: str
@@ -81,6 +83,7 @@ class Network:
     modules: tuple[str, ...] = ()
     install: str = ""
     training: str = ""
+    most_views: int = 40
 
     def missing(self) -> tuple[str, ...]:
         """Those of ``modules`` that are not installed; nothing is imported."""
@@ -119,6 +122,7 @@ NETWORKS: dict[str, Network] = {
             checkpoint=None,
             image_size=256,
             stride=16,
+            most_views=128,
         ),
         Network(
             name="mini",

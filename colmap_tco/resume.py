@@ -46,10 +46,15 @@ def fingerprint(settings: Mapping[str, object], contents: Iterable[Path], files:
 
 
 class _Record(NamedTuple):
-    """What a manifest holds of the work that was done: figures of views by name, and of chunks."""
+    """What a manifest holds of the work that was done: figures of views by name, and of chunks.
+
+    Attributes:
+        chunk_size: views of the largest chunk that was planned with; 0: nothing was planned.
+    """
 
     views: dict[str, dict[str, object]]
     chunks: list[dict[str, object]]
+    chunk_size: int = 0
 
 
 class Result:
@@ -65,7 +70,7 @@ class Result:
     def __init__(self, root: Path, keys: tuple[str, str], finished: bool, record: _Record) -> None:
         self.paths: DensePaths = dense_paths(root) if finished else partial_paths(root)
         self.finished = finished
-        self.views, self.chunks = record
+        self.views, self.chunks, self._chunk_size = record
         self._root = root
         self._fingerprint, self._maps = keys
 
@@ -73,9 +78,21 @@ class Result:
         """Whether this view was finished, now or by an earlier run."""
         return name in self.views
 
-    def mark_done(self, name: str, figures: Mapping[str, object]) -> None:
-        """Record that all files of a view are written, with its figures for the report."""
-        self.views[name] = dict(figures)
+    def chunk_size(self, limit: int) -> int:
+        """Views of a chunk to plan with: what an earlier run planned with, else ``limit``.
+
+        The free memory is another in every run. Chunks of another size would hold other views, so that those
+        of a finished chunk would be predicted again.
+        """
+        self._chunk_size = self._chunk_size or limit
+        return self._chunk_size
+
+    def mark_done(self, views: Mapping[str, Mapping[str, object]]) -> None:
+        """Record that all files of some views, by name, are written, with the figures of each for the report.
+
+        The manifest is written as a whole, so that many views are better told of at once.
+        """
+        self.views.update({name: dict(figures) for name, figures in views.items()})
         self._save(complete=False)
 
     def mark_chunk(self, figures: Mapping[str, object]) -> None:
@@ -107,6 +124,7 @@ class Result:
             "fingerprint": self._fingerprint,
             "maps": self._maps,
             "complete": complete,
+            "chunk_size": self._chunk_size,
             "chunks": self.chunks,
             "views": self.views,
         }
@@ -199,7 +217,7 @@ def _resume(partial: DensePaths, maps: str) -> _Record:
     record = _record(partial)
     views = {name: figures for name, figures in record.views.items() if _all_there(partial, name)}
     log.info("%s: going on after %d finished views", partial.root, len(views))
-    return _Record(views, record.chunks)
+    return record._replace(views=views)
 
 
 def _reuse(final: DensePaths, partial: DensePaths) -> _Record:
@@ -217,7 +235,7 @@ def _reuse(final: DensePaths, partial: DensePaths) -> _Record:
             except OSError:  # a file system without hard links
                 shutil.copy2(old, new)
     log.info("%s: the depth maps of %d views are kept", final.root, len(views))
-    return _Record(views, record.chunks)
+    return record._replace(views=views)
 
 
 def _all_there(paths: DensePaths, name: str) -> bool:
@@ -270,7 +288,10 @@ def _maps_key(paths: DensePaths) -> object:
 
 
 def _record(paths: DensePaths) -> _Record:
-    views, chunks = _read(paths).get("views"), _read(paths).get("chunks")
+    manifest = _read(paths)
+    views, chunks, size = manifest.get("views"), manifest.get("chunks"), manifest.get("chunk_size")
     return _Record(
-        dict(views) if isinstance(views, dict) else {}, list(chunks) if isinstance(chunks, list) else []
+        dict(views) if isinstance(views, dict) else {},
+        list(chunks) if isinstance(chunks, list) else [],
+        size if isinstance(size, int) else 0,
     )

@@ -13,10 +13,10 @@ Views of one chunk are padded symmetrically to a common canvas, which keeps prin
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -182,28 +182,55 @@ def _pinhole_or_error(camera: Camera) -> Pinhole | InputError:
         return error
 
 
-def undistorted_image(view: View) -> tuple[NDArray[np.uint8], Mask]:
+class Band(NamedTuple):
+    """Some rows of the undistorted images of a camera.
+
+    Attributes:
+        rows: of the image.
+        u, v: (h, W) places in the original, as ``cv2.remap`` wants them.
+        valid: (h, W) whether these are in the picture, and the distortion has an inverse there.
+    """
+
+    rows: slice
+    u: NDArray[np.float32]
+    v: NDArray[np.float32]
+    valid: Mask
+
+
+def sampling(view: View) -> Iterator[Band]:
+    """Where the undistorted image of a view takes its pixels: alike for all views of a camera."""
+    cells = trusted_cells(view.original, view.camera)
+    for rows, pixels in _bands(view):
+        trusted = cells[rows.start // CELL : -(-rows.stop // CELL)].repeat(CELL, 0).repeat(CELL, 1)
+        with np.errstate(invalid="ignore"):
+            within = (pixels >= 0) & (pixels <= _pycolmap.camera_size(view.original))
+        inside: Mask = np.logical_and(within[..., 0], within[..., 1])
+        yield Band(rows, *_for_opencv(pixels), inside & trusted[: len(inside), : inside.shape[1]])
+
+
+def undistorted_image(view: View, bands: Iterable[Band] | None = None) -> tuple[NDArray[np.uint8], Mask]:
     """RGB (H, W, 3) in the frame of ``view.camera``, and where it is picture and not masked (H, W).
 
     Works in bands of rows, so that the maps of large images stay small.
+
+    Args:
+        view: the view.
+        bands: its :func:`sampling`, if it is known already.
 
     Raises:
         InputError: the image or its mask cannot be read or has another size than the camera.
     """
     import cv2
 
-    camera, edge = view.camera, cv2.BORDER_REPLICATE
+    edge = cv2.BORDER_REPLICATE
     source = read_image(view.path)
     _check_size(view, view.path, source)
     mask = _read_mask(view)
-    image = np.zeros((camera.height, camera.width, 3), np.uint8)
-    cells = trusted_cells(view.original, camera)
-    valid = cells.repeat(CELL, 0).repeat(CELL, 1)[: camera.height, : camera.width]
-    for rows, pixels in _bands(view):
-        with np.errstate(invalid="ignore"):
-            valid[rows] &= ((pixels >= 0) & (pixels <= _pycolmap.camera_size(view.original))).all(-1)
-        u, v = _for_opencv(pixels)
+    image = np.zeros((view.camera.height, view.camera.width, 3), np.uint8)
+    valid = np.zeros(image.shape[:2], bool)
+    for rows, u, v, there in sampling(view) if bands is None else bands:
         image[rows] = cv2.remap(source, u, v, cv2.INTER_CUBIC, borderMode=edge)
+        valid[rows] = there
         if mask is not None:
             valid[rows] &= cv2.remap(mask, u, v, cv2.INTER_NEAREST, borderMode=edge) > 0
     image[~valid] = 0
@@ -267,21 +294,23 @@ def _read_mask(view: View) -> NDArray[Any] | None:
     return mask
 
 
-Take = Callable[[View, NDArray[np.uint8]], None]
-"""Is given a view and its undistorted image (H, W, 3)."""
+Picture = tuple[NDArray[np.float32], Mask]
+"""RGB (h, w, 3) in [0, 1] in the frame of ``View.network``, and its valid pixels (h, w)."""
 
 
-def network_image(view: View, take: Take | None = None) -> tuple[NDArray[np.float32], Mask]:
-    """RGB (h, w, 3) in [0, 1] in the frame of ``view.network``, and its valid pixels (h, w).
+def network_image(view: View) -> Picture:
+    """The undistorted image of a view, as small as the network sees it; see :func:`resized`."""
+    return resized(view, *undistorted_image(view))
+
+
+def resized(view: View, image: NDArray[np.uint8], valid: Mask) -> Picture:
+    """The picture for the network of an undistorted image (H, W, 3) and its valid pixels (H, W).
 
     Area-filtered. Only valid pixels contribute, so that padding does not darken the border; a pixel
-    is valid if at least half of its area is. ``take`` is given the undistorted image that they are of.
+    is valid if at least half of its area is.
     """
     import cv2
 
-    image, valid = undistorted_image(view)
-    if take is not None:
-        take(view, image)
     size = (view.network.width, view.network.height)
     weight = valid.astype(np.float32)
     share = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
@@ -328,13 +357,19 @@ def canvas_cameras(views: Sequence[View], frame: ChunkFrame) -> Cameras:
     return Cameras(torch.from_numpy(poses).float(), torch.from_numpy(K).float())
 
 
-def batch(views: Sequence[View], frame: ChunkFrame, take: Take | None = None) -> tuple[Views, Cameras]:
+def batch(
+    views: Sequence[View],
+    frame: ChunkFrame,
+    picture: Callable[[View], Picture] = network_image,
+    helpers: int = 0,
+) -> tuple[Views, Cameras]:
     """Images and cameras of a chunk on a common canvas, float32.
 
     Args:
         views: of the chunk.
         frame: of the chunk.
-        take: is given each view and its undistorted image, which takes long to make and is not kept.
+        picture: makes the picture of a view, which takes long where photos are large.
+        helpers: how many of the last views only help the others.
 
     Raises:
         InputError: an image cannot be read.
@@ -347,10 +382,11 @@ def batch(views: Sequence[View], frame: ChunkFrame, take: Take | None = None) ->
     images = torch.zeros(len(views), 3, *canvas)
     valid = torch.zeros(len(views), *canvas, dtype=torch.bool)
     for i, view in enumerate(views):
-        rgb, keep = network_image(view, take)
+        rgb, keep = picture(view)
         crop(view, images[i])[:] = torch.from_numpy(rgb).permute(2, 0, 1)
         crop(view, valid[i])[:] = torch.from_numpy(keep)
-    return Views(images, valid, tuple(view.name for view in views)), canvas_cameras(views, frame)
+    names = tuple(view.name for view in views)
+    return Views(images, valid, names, helpers), canvas_cameras(views, frame)
 
 
 def crop(view: View, maps: _Map) -> _Map:

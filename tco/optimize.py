@@ -34,7 +34,7 @@ class Outcome:
     """What optimisation gives.
 
     Attributes:
-        prediction: of all views.
+        prediction: of all views; those that only help (``Views.helpers``) as the steps knew them.
         cameras: of all views, with their corrections.
         corrections: how far each camera went (``CameraCorrections.sizes``); empty if none could move.
         history: the named terms of every step, unweighted, and their weighted sum as ``loss``; first the
@@ -142,7 +142,7 @@ class _Run:
         a = config.ablation
         self.free = FreePixels(context.depth, a.free_depth, a.free_surfels)
         self.freshness = Freshness(len(views), config.refresh, config.lazy_refresh)
-        self.sources = Sources(a.source_order, self.terms.overlap, generator)
+        self.sources = Sources(a.source_order, self.terms.overlap, generator, views.helpers)
         patience = config.stop_after * config.sources
         self.stagnation = Stagnation(len(views), patience) if patience else None
         self.history: list[dict[str, float]] = []
@@ -318,17 +318,24 @@ class _Run:
     def outcome(self) -> Outcome:
         """Predict all views with the adapted network, as the best step had it if the last ruined it."""
         with torch.no_grad():
-            self._reencode()
-            prediction = self._decode(self.encoded, context=self.context)
+            anew = self._reencode()
+            prediction = self._last(anew)
             if not bool(torch.isfinite(prediction.depth).all()):
                 logger.warning("the last step gave depths that are not finite; back to the best state")
                 self._roll_back(self.config.steps)
-                prediction = self._decode(self.encoded, context=self.context)
+                prediction = self._last(anew)
             cameras = self.cameras(prediction)
         cameras = Cameras(cameras.world_from_cam.detach(), cameras.K.detach())
         prediction = detached(prediction)
         sizes = {} if self.corrections is None else self.corrections.sizes()
         return Outcome(prediction, cameras, sizes, self.history, tuple(self.rolled_back))
+
+    def _last(self, anew: bool) -> Prediction:
+        """All views by the network as it is now; helpers as they were, unless they were encoded ``anew``."""
+        if anew or not self.views.helpers:
+            return self._decode(self.encoded, context=self.context)
+        part = self._decode(self.encoded, list(self.views.wanted), self.context)
+        return merged(self.context, part)
 
     def polished(self, outcome: Outcome, report: Report | None) -> Outcome:
         """The outcome with its depths refined, if that is wanted; where cameras are sought it is not."""

@@ -95,7 +95,7 @@ def polish(
     report: Callable[[int, dict[str, float]], None] | None = None,
     watched: Sequence[SparseDepth] = (),
 ) -> Polished:
-    """Refine the depths of all V views; confidences stay.
+    """Refine the depths of all V views but those that only help; confidences stay.
 
     Args:
         prediction: of all views.
@@ -111,7 +111,7 @@ def polish(
     optimiser = torch.optim.Adam(run.field.parameters(), c.polish_rate, BETAS)
     history: list[dict[str, float]] = []
     skipped: list[int] = []
-    steps = c.steps(len(prediction.depth))
+    steps = c.steps(len(terms.views.wanted))
     for step in range(steps):
         for group in optimiser.param_groups:
             group["lr"] = c.polish_rate * (1 - (1 - LAST_RATE) * step / steps)
@@ -139,7 +139,7 @@ class _Polishing:
         self.prediction, self.cameras, self.terms, self.config = prediction, cameras, terms, config
         self.generator, self.watched = generator, watched
         self.field = DepthField(prediction.depth, config.polish.polish_levels)
-        self.sources = Sources("epoch", terms.overlap, generator)
+        self.sources = Sources("epoch", terms.overlap, generator, terms.views.helpers)
         self.weights = _weights(terms, config)
         self.edges = picture_edges(terms.views.images)
         self.now = replace(prediction, depth=prediction.depth.clone(), stages=())

@@ -16,8 +16,8 @@ class Sources:
     drawn twice.
     """
 
-    def __init__(self, order: str, overlap: Tensor, generator: torch.Generator) -> None:
-        """Draw by ``order`` from V views with ``overlap`` (V, V).
+    def __init__(self, order: str, overlap: Tensor, generator: torch.Generator, helpers: int = 0) -> None:
+        """Draw by ``order`` from V views with ``overlap`` (V, V), the last ``helpers`` of them never.
 
         Raises:
             ValueError: an order that does not exist.
@@ -27,7 +27,7 @@ class Sources:
         self.order, self.generator, self.queue = order, generator, list[int]()
         odds = overlap.detach().cpu().double().clone()
         odds.fill_diagonal_(0)
-        shared = odds.sum(1)
+        shared = odds.sum(1)[: len(odds) - helpers]
         # Views that share nothing have other terms than the compatibility, and get a chance, too.
         self.odds = shared + 0.01 * shared.mean() if bool(shared.any()) else torch.ones_like(shared)
         if order == "uniform":

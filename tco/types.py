@@ -57,14 +57,21 @@ class Views(_Movable):
         images: (V, 3, H, W) RGB in [0, 1].
         valid: (V, H, W) bool; False where the canvas is padding or masked out.
         names: V image names, used in messages alone.
+        helpers: how many of the last views only help the others: their own depths are not asked for.
     """
 
     images: Tensor
     valid: Tensor
     names: tuple[str, ...]
+    helpers: int = 0
 
     def __len__(self) -> int:
         return int(self.images.shape[0])
+
+    @property
+    def wanted(self) -> range:
+        """Indices of the views whose depths are asked for."""
+        return range(len(self) - self.helpers)
 
     @property
     def size(self) -> tuple[int, int]:

@@ -182,15 +182,22 @@ def all_maps(paths: DensePaths, views: Sequence[View], limits: Limits) -> dict[s
         if total <= limits.map_bytes or len(made) <= 1:
             break
         share = len(made) / len(views[::every])
-        smaller = scale * min(0.8, float(np.sqrt(share * limits.map_bytes / total)))
+        smaller = scale * min(0.8, MARGIN * float(np.sqrt(share * limits.map_bytes / total)))
         longest = max(max(v.network.width, v.network.height) for v in views)
         if smaller * longest >= limits.smallest:
             scale = smaller
         else:
             every = max(every + 1, int(np.ceil(every / share)))
     if every > 1 or scale < 1:
-        log.info("the page shows the maps of every %d. view at %.0f %% of their size", every, 100 * scale)
+        shown, all_views = len(views[::every]), len(views)
+        log.info(
+            "the page shows maps of %d of %d views, at %.0f %% of their size", shown, all_views, 100 * scale
+        )
     return made
+
+
+MARGIN = 0.93
+"""Of the size that is estimated to fit: small pictures take more bytes a pixel, and a new try takes time."""
 
 
 def view_maps(paths: DensePaths, view: View, scale: float) -> tuple[dict[str, Any], int]:

@@ -64,6 +64,12 @@ class Stage:
         """Without gradients and scores."""
         return Stage(self.inverse.detach(), self.log_error.detach())
 
+    def replaced(self, views: Sequence[int], new: Stage) -> Stage:
+        """With what is new of some views, without scores."""
+        index = torch.as_tensor(list(views), device=self.inverse.device)
+        pairs = (self.inverse, new.inverse), (self.log_error, new.log_error)
+        return Stage(*(old.index_copy(0, index, part.to(old.dtype)) for old, part in pairs))
+
     def doubled(self) -> Stage:
         """At twice the resolution, without scores."""
         both = torch.stack([self.inverse, self.log_error], 1)
@@ -192,7 +198,8 @@ class Sweep(nn.Module):
         for k in range(len(self.config.spacing)):
             own = stage.detached() if k else stage.detached().doubled()
             kept.append(torch.stack([own.inverse, own.log_error], 1))
-            stage = self.refine(k, encoded, chosen, stage, own if worlds is None else worlds[k])
+            world = own if worlds is None else worlds[k].replaced(chosen, own)
+            stage = self.refine(k, encoded, chosen, stage, world)
         confidence = expected_confidence(stage.log_error)
         return Prediction(1 / stage.inverse, confidence, encoded.cameras, chosen, tuple(kept))
 

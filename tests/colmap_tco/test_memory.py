@@ -48,16 +48,17 @@ def test_views_and_bytes_are_inverse() -> None:
     for pixels in (10_000, 300_000):
         for views in (2, 7, 40):
             assert needs.views(pixels, needs.bytes(views, pixels)) == pytest.approx(views, rel=1e-6)
-            assert chunk_limit(needs, pixels, round(needs.bytes(views, pixels) / SHARE) + 1000) == views
+            assert chunk_limit(needs, pixels, round(needs.bytes(views, pixels) / SHARE) + 1000, 40) == views
 
 
 def test_chunks_grow_with_the_memory_and_shrink_with_the_images() -> None:
     needs = footprint("sweep", "cpu", steps=40)
-    limits = [chunk_limit(needs, 50_000, memory) for memory in np.logspace(6, 13, 40).astype(int).tolist()]
+    memories = np.logspace(6, 13, 40).astype(int).tolist()
+    limits = [chunk_limit(needs, 50_000, memory, 128) for memory in memories]
     assert limits == sorted(limits)
-    assert (limits[0], limits[-1]) == (2, 40)
+    assert (limits[0], limits[-1]) == (2, 128)
     some = round(needs.bytes(20, 50_000) / SHARE) + 1000
-    assert chunk_limit(needs, 50_000, some) == 20 > chunk_limit(needs, 100_000, some)
+    assert chunk_limit(needs, 50_000, some, 128) == 20 > chunk_limit(needs, 100_000, some, 128)
 
 
 @pytest.mark.parametrize("name", NETWORKS)

@@ -24,6 +24,7 @@ from colmap_tco.normals import normals_from_depth
 from colmap_tco.outputs import (
     ViewMaps,
     fusion_views,
+    no_finer,
     plain,
     read_view,
     undistorted_model,
@@ -146,7 +147,7 @@ def densify(root: Path, seed: int = 0, overwrite: bool = False, stop_after: int 
     for count, view in enumerate(views):
         if not result.is_done(view.name):
             write_view(result.paths, view, maps_of(view))
-            result.mark_done(view.name, {"seed": seed, "written": time.time_ns()})
+            result.mark_done({view.name: {"seed": seed, "written": time.time_ns()}})
         if stop_after == count + 1:
             print("stopped", flush=True)
             time.sleep(60)
@@ -361,7 +362,7 @@ def test_a_finished_view_with_a_lost_file_is_made_again(workspace: Path) -> None
     result = open_result(workspace, "key")
     for view in views[:2]:
         write_view(result.paths, view, maps_of(view))
-        result.mark_done(view.name, {})
+        result.mark_done({view.name: {}})
     result.paths.normal_map(views[0].name).unlink()
     again = open_result(workspace, "key")
     assert not again.is_done(views[0].name)
@@ -382,7 +383,7 @@ def test_an_error_says_which_settings_are_others(workspace: Path) -> None:
 
 def test_a_partial_result_of_other_settings_is_dropped(workspace: Path) -> None:
     result = open_result(workspace, "one")
-    result.mark_done("a", {})
+    result.mark_done({"a": {}})
     (result.paths.root / "left.bin").write_bytes(b"1")
     assert not open_result(workspace, "two").views
     assert not (result.paths.root / "left.bin").exists()
@@ -393,7 +394,7 @@ def test_work_on_maps_is_kept_where_only_what_follows_differs(workspace: Path) -
     _, views = opened(workspace)
     result = open_result(workspace, "one", maps="m")
     write_view(result.paths, views[0], maps_of(views[0]))
-    result.mark_done(views[0].name, {"a": 1})
+    result.mark_done({views[0].name: {"a": 1}})
     result.mark_chunk({"loss": [1.5]})
     again = open_result(workspace, "two", maps="m")
     assert again.views == {views[0].name: {"a": 1}} and again.chunks == [{"loss": [1.5]}]
@@ -498,3 +499,17 @@ def test_reports_are_plain_json(tmp_path: Path) -> None:
     }
     with pytest.raises(TypeError, match="object"):
         plain({"a": object()})
+
+
+@pytest.mark.parametrize(("size", "expected"), [((750, 1000), (375, 500)), ((399, 1600), (399, 1600))])
+def test_large_images_are_fused_at_less_than_their_size(
+    size: tuple[int, int], expected: tuple[int, int]
+) -> None:
+    """They keep their field of view: what lies at a share of the sides lies there still."""
+    y, x = ((np.arange(n) + 0.5) / n for n in size)
+    ramp = np.stack(np.broadcast_arrays(240 * y[:, None], 240 * x, 120.0), -1).round().astype(np.uint8)
+    got = no_finer(ramp, (75, 100))
+    assert got.shape == (*expected, 3)
+    y, x = ((np.arange(n) + 0.5) / n for n in expected)
+    assert np.abs(got[..., 0] - 240 * y[:, None]).max() < 1.1
+    assert np.abs(got[..., 1] - 240 * x).max() < 1.1

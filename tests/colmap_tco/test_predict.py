@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -13,16 +14,18 @@ from numpy.typing import NDArray
 from colmap_tco.backbones import NetworkConfig, load, select
 from colmap_tco.chunks import Chunk
 from colmap_tco.errors import InputError
+from colmap_tco.pictures import Pictures
 from colmap_tco.predict import ChunkResult, corrected_view, predict_chunk
 from colmap_tco.priors import PriorConfig, chunk_frame
 from colmap_tco.tracks import Tracks, read_tracks
 from colmap_tco.views import (
     ChunkFrame,
-    Take,
+    Picture,
     View,
     ViewConfig,
     canvas_cameras,
     make_views,
+    network_image,
     undistorted_image,
 )
 from colmap_tco.workspace import open_workspace
@@ -48,24 +51,27 @@ def known(room: Room) -> Input:
 
 
 def predicted(
-    known: Input, chunk: Chunk, steps: int = 0, holdout: float = 0.2, take: Take | None = None
+    known: Input,
+    chunk: Chunk,
+    steps: int = 0,
+    holdout: float = 0.2,
+    picture: Callable[[View], Picture] = network_image,
 ) -> ChunkResult:
     settings = (PriorConfig(holdout=holdout), TCOConfig(steps=steps), 0)
     return predict_chunk(
         (load(select(NetworkConfig(backbone="sweep", device="cpu"))), torch.device("cpu")),
-        known.tracks, known.views, chunk, settings, lambda _: None, take,
+        known.tracks, known.views, chunk, settings, lambda _: None, picture,
     )  # fmt: skip
 
 
 def test_maps_are_in_colmap_units_and_of_the_size_of_the_network_images(known: Input, room: Room) -> None:
-    pictures: dict[str, NDArray[np.uint8]] = {}
-    result = predicted(
-        known, Chunk((1, 3, 4), (2,)), take=lambda view, image: pictures.update({view.name: image})
-    )
+    taken: dict[str, NDArray[np.uint8]] = {}
+    pictures = Pictures(lambda view, image: taken.update({view.name: image}))
+    result = predicted(known, Chunk((1, 3, 4), (2,)), picture=pictures)
     assert sorted(result.views) == [known.views[i].name for i in (1, 3, 4)]  # not those of the context
-    assert sorted(pictures) == sorted(result.views)
+    assert sorted(taken) == [known.views[i].name for i in (1, 2, 3, 4)]
     name = known.views[3].name
-    assert (pictures[name] == undistorted_image(known.views[3])[0]).all()
+    assert (taken[name] == undistorted_image(known.views[3])[0]).all()
     assert result.history == []
     for index in (1, 3, 4):
         view = known.views[index]

@@ -20,6 +20,7 @@ from tco.backbones.weights import load_sweep
 from tco.optimize import Outcome, errors_at_points, optimize
 from tco.options import PolishConfig, TCOConfig
 from tco.penalties import sparse_depth
+from tco.toy import Toy, wall
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
 
 Scene = tuple[Views, Priors, Tensor]
@@ -488,3 +489,14 @@ def test_watched_points_are_measured_in_every_step_and_steer_nothing(scene: Scen
     without = optimize(Small(), views, priors, SMALL)
     assert torch.equal(depth_of(with_points), depth_of(without))
     assert [t["loss"] for t in with_points.history] == [t["loss"] for t in without.history]
+
+
+def test_views_that_only_help_are_left_as_the_network_has_them() -> None:
+    """As the steps knew them, here from the first on; those that are asked for come nearer to the truth."""
+    scene, polish = wall(), PolishConfig(polish_looks=0)
+    config = TCOConfig(steps=12, rate=0.01, lora_targets=("plane",), camera_rate=0, refresh=20, polish=polish)
+    plain = optimize(Toy(), scene.views, scene.priors, replace(config, steps=0))
+    done = optimize(Toy(), replace(scene.views, helpers=1), scene.priors, config)
+    assert torch.equal(done.prediction.depth[3:], plain.prediction.depth[3:])
+    error = [float((o.prediction.depth / scene.depth - 1).abs()[:3].mean()) for o in (plain, done)]
+    assert error[1] < error[0] / 3

@@ -132,7 +132,7 @@ def test_cells_must_have_a_size() -> None:
     for levels in ((), (0, 2)):
         with pytest.raises(ValueError, match="at least a pixel"):
             DepthField(torch.ones(1, 4, 4), levels)
-    with pytest.raises(ValueError, match="a source and a level"):
+    with pytest.raises(ValueError, match="there must be a level"):
         PolishConfig(polish_levels=())
 
 
@@ -221,3 +221,21 @@ def test_it_follows_the_steps_on_the_network(scene: Wall) -> None:
     none = optimize(Toy(), scene.views, scene.priors, replace(config, steps=0))
     assert none.history == [] and replace(config, steps=0).all_steps(4) == 0
     assert config.reference_schedule().all_steps(4) == 2
+
+
+@pytest.mark.parametrize("views", [2, 15, 16, 40, 100])
+def test_each_view_comes_as_often_however_many_there_are(views: int) -> None:
+    for sources in (2, 3):
+        config = PolishConfig(polish_sources=sources)
+        visits = sources * config.steps(views) / views
+        assert config.polish_looks <= visits < config.polish_looks + sources / views
+
+
+def test_views_that_only_help_stay_as_they_are(scene: Wall) -> None:
+    """The others are refined all the same."""
+    wrong = predicted(scene, bump(scene, 0.04))
+    helped = replace(scene, views=replace(scene.views, helpers=2))
+    got = refined(helped, wrong)
+    assert torch.equal(got.depth[2:], wrong.depth[2:])
+    error, before = ((p.depth / scene.depth - 1).abs()[:2].mean() for p in (got, wrong))
+    assert error < 0.7 * before

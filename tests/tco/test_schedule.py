@@ -91,3 +91,11 @@ def test_a_hard_view_after_an_easy_one_is_no_stagnation() -> None:
     """Errors of 1 and 9 that both fall: the later of two successive errors is often the larger one."""
     watch = Stagnation(2, patience=2)
     assert not any(watch.add(i % 2, (1.0, 9.0)[i % 2] * 0.95**i) for i in range(20))
+
+
+@pytest.mark.parametrize("order", ["epoch", "overlap", "uniform"])
+def test_views_that_only_help_are_never_sources(order: str) -> None:
+    sources = Sources(order, OVERLAP, generator(), helpers=2)
+    drawn = [view for _ in range(12) for view in sources.draw(1)]
+    assert set(drawn) == {0, 1}
+    assert sorted(sources.draw(4)) == [0, 1]
