@@ -55,7 +55,8 @@ class Environment:
 
     def summary(self) -> str:
         """One line."""
-        return f"{os.environ.get('OMP_WAIT_POLICY')} {'torch' in sys.modules}"
+        policy, spins = map(os.environ.get, ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT"))
+        return f"{policy} {spins} {'torch' in sys.modules}"
 
 
 ERRORS: dict[str, Exception] = {

@@ -106,13 +106,17 @@ def test_usage_errors_exit_2_with_the_remedy(words: tuple[str, ...], told: str) 
 
 
 @pytest.mark.parametrize(
-    ("given", "policy"),
-    [({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE"), ({"GOMP_SPINCOUNT": "5"}, None)],
+    ("given", "told"),
+    [
+        ({}, "None 1000"),
+        ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE None"),
+        ({"GOMP_SPINCOUNT": "5"}, "None 5"),
+    ],
 )
-def test_idle_threads_sleep_unless_told_otherwise(given: dict[str, str], policy: str | None) -> None:
+def test_idle_threads_soon_sleep_unless_told_otherwise(given: dict[str, str], told: str) -> None:
     """As the environment has it when the work begins, before which torch is not loaded."""
     done = run("example", "scene", "--failure", "environment", environment=given)
-    assert done.stdout == f"{policy} False\n"
+    assert done.stdout == f"{told} False\n"
 
 
 def test_quiet_keeps_warnings_and_drops_progress() -> None:
