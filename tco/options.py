@@ -51,12 +51,12 @@ class PolishConfig:
     """Refinement of each pixel's depth after the network was adapted (``tco/polish.py``)."""
 
     polish_looks: int = knob(
-        8,
+        10,
         "times that each view's depths are refined, after the steps on the network; 0, or no steps at all: "
         "never",
     )
     polish_rate: float = knob(
-        7e-3, "learning rate of the logarithms of the depths' factors (Adam); lower it if surfaces get rough"
+        6.5e-3, "learning rate of the logarithms of the depths' factors (Adam); lower it if surfaces get rough"
     )
     polish_sources: int = knob(2, "views whose depths each step of these refines")
     polish_smoothness: float = knob(
