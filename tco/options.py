@@ -56,7 +56,8 @@ class PolishConfig:
         "never",
     )
     polish_rate: float = knob(
-        6.5e-3, "learning rate of the logarithms of the depths' factors (Adam); lower it if surfaces get rough"
+        6.5e-3,
+        "learning rate of the logarithms of the depths' factors (Adam); lower it if surfaces get rough",
     )
     polish_sources: int = knob(2, "views whose depths each step of these refines")
     polish_smoothness: float = knob(
