@@ -142,7 +142,7 @@ MUTATIONS = [
         ("down * field.diff(dim=0).abs()", "0 * field.diff(dim=0).abs()"),
         ('weights["warped"] = weights.pop("photometric")', 'weights.pop("photometric")'),
         ("if weight > 0}", "if weight < 0}"),
-        ("self.prediction.depth[chosen] * factor", "self.prediction.depth[chosen] / factor"),
+        ("self.prediction.depth[chosen] * factor", "self.prediction.depth[chosen] * factor.detach()"),
         ("self.now.depth[seen] = self.refined(seen).depth", "self.now.depth[seen] *= 1"),
         ("view * len(self.levels) + i", "view + i * len(self.levels)"),
     ),

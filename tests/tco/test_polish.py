@@ -166,6 +166,17 @@ def test_the_same_seed_gives_the_same_depths(scene: Wall) -> None:
     assert torch.equal(first, again) and not torch.equal(first, other)
 
 
+def test_depths_are_compared_with_those_of_the_moment(scene: Wall) -> None:
+    """Tied to each other alone, views 3 % apart meet; against those of before they would change places."""
+    sign = torch.tensor([1.0, -1.0, 1.0, -1.0])
+    apart = predicted(scene, (1 + 0.015 * sign)[:, None, None].expand_as(scene.depth))
+    tied = replace(CONFIG.polish, polish_consistency=1.0, polish_rate=4e-3, polish_looks=16, polish_sources=1)
+    config = replace(CONFIG, photometric_weight=0.0, sparse_weight=0.0, polish=tied)
+    factors = (refined(scene, apart, config).depth / scene.depth).flatten(1).median(1).values
+    assert float(factors.max() - factors.min()) < 0.01
+    assert float((factors - 1).abs().max()) < 0.015
+
+
 def test_views_that_share_nothing_are_drawn_to_their_points(scene: Wall) -> None:
     alone = replace(scene, priors=replace(scene.priors, overlap=torch.zeros(4, 4)))
     far = predicted(scene, torch.full_like(scene.depth, 1.03))

@@ -12,10 +12,12 @@ from torch import Tensor
 
 import tco.optimize
 from tco.backbones.base import Backbone
+from tco.corrections import CameraCorrections
 from tco.geometry import invert, project, sample, so3_exp, transform, unproject
 from tco.optimize import Outcome, optimize
 from tco.options import AblationConfig, PolishConfig, TCOConfig
-from tco.penalties import rotation_angle
+from tco.penalties import focal, rotation, rotation_angle, translation
+from tco.terms import Terms
 from tco.toy import Toy, Wall, wall
 from tco.types import Cameras
 
@@ -142,6 +144,26 @@ def test_plain_camera_penalties_are_the_papers(scene: Wall) -> None:
     assert got["loss"] == pytest.approx(
         got["photometric"] + got["cameras"] + got["consistency"] + 0.01 * got["sparse"], rel=1e-5
     )
+
+
+def test_plain_camera_penalties_weigh_1_2_and_a_hundredth(scene: Wall) -> None:
+    """Rotation, centres and focal length alone, each against its own penalty."""
+    config = TCOConfig(ablation=AblationConfig(plain_cameras=True))
+    given = scene.priors.cameras
+    assert given is not None
+    terms, corrections = Terms(scene.views, scene.priors, config), CameraCorrections(scene.priors)
+    turn, pose, K = so3_exp(torch.tensor([0.0, 0.05, 0.0])), given.world_from_cam.clone(), given.K.clone()
+    pose[1, :3, :3] = pose[1, :3, :3] @ turn
+    rotated = terms.of_cameras(corrections, Cameras(pose, given.K))
+    torch.testing.assert_close(rotated, rotation(pose, given.world_from_cam))
+    pose = given.world_from_cam.clone()
+    pose[1, 0, 3] += 0.1
+    moved = terms.of_cameras(corrections, Cameras(pose, given.K))
+    torch.testing.assert_close(moved, 2 * translation(pose, given.world_from_cam))
+    K[:, 0, 0] *= 1.1
+    zoomed = terms.of_cameras(corrections, Cameras(given.world_from_cam, K))
+    torch.testing.assert_close(zoomed, 0.01 * focal(K, given.K))
+    assert min(map(float, (rotated, moved, zoomed))) > 1e-4
 
 
 def test_corrected_cameras_are_given_to_the_network(scene: Wall) -> None:
