@@ -96,9 +96,10 @@ def test_all_rows_run_and_differ_where_they_should(config: BenchConfig) -> None:
     assert tuple(table(config)) == ROWS
     found = {row: tuple(figures(config, row, "kitchen").values()) for row in ROWS}
     assert all(np.isfinite(values).all() and min(values) > 0 for values in found.values())
-    assert found["base"] == found["steps=0"]
-    others = [found[row] for row in ROWS if row != "steps=0"]
-    assert len(set(others)) == len(others)
+    # Open3D sums in the order in which its threads come.
+    assert found["base"] == pytest.approx(found["steps=0"], rel=1e-9)
+    others = {tuple(f"{value:.9e}" for value in found[row]) for row in ROWS if row != "steps=0"}
+    assert len(others) == len(ROWS) - 1
 
 
 def test_the_tables_hold_the_means_over_scenes_beside_the_published_figures(config: BenchConfig) -> None:
