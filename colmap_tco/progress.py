@@ -118,7 +118,7 @@ class Progress:
         if self._done < 2 * counted:
             # The first step, which loads and compiles, is still most of what there is to go by.
             since, counted = self._stage_start, 0.0
-        if not self._done or self._done - counted < _TOO_LITTLE * self._total:
+        if not self._done or self._done - counted <= _TOO_LITTLE * self._total:
             start = self._run_start if self._shares else self._stage_start
             return remaining(now - start, self.fraction) if self.fraction >= _TOO_EARLY else None
         left = (now - since) / (self._done - counted) * max(0, self._total - self._done)

@@ -132,7 +132,7 @@ def test_cells_must_have_a_size() -> None:
     for levels in ((), (0, 2)):
         with pytest.raises(ValueError, match="at least a pixel"):
             DepthField(torch.ones(1, 4, 4), levels)
-    with pytest.raises(ValueError, match="there must be a level"):
+    with pytest.raises(ValueError, match="a source and a level"):
         PolishConfig(polish_levels=())
 
 
