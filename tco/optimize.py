@@ -19,7 +19,7 @@ from tco.free import FreePixels
 from tco.lora import LoRAConfig, adapted
 from tco.options import TCOConfig
 from tco.penalties import sparse_depth
-from tco.polish import polish
+from tco.polish import displacement, polish
 from tco.schedule import Sources, Stagnation, draw_targets
 from tco.terms import COMPATIBILITY, ExtraTerm, Terms, errors_at, means
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
@@ -339,7 +339,16 @@ class _Run:
 
     def polished(self, outcome: Outcome, report: Report | None) -> Outcome:
         """The outcome with its depths refined, if that is wanted; where cameras are sought it is not."""
-        if self.config.polish.polish_looks == 0 or self.priors.cameras is None:
+        c = self.config.polish
+        if c.polish_looks == 0 or self.priors.cameras is None:
+            return outcome
+        size = outcome.prediction.depth.shape[-2:]
+        moved = displacement(self.priors, (size[0], size[1]))
+        if moved > c.polish_uncertainty:
+            logger.warning(
+                "the cameras are uncertain by %.1f pixels: depths are not refined (--polish_uncertainty)",
+                moved * max(size),
+            )
             return outcome
         done = polish(
             outcome.prediction, outcome.cameras, self.terms, self.config, self.generator, report, self.watched

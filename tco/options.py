@@ -59,6 +59,11 @@ class PolishConfig:
         6.5e-3,
         "learning rate of the logarithms of the depths' factors (Adam); lower it if surfaces get rough",
     )
+    polish_uncertainty: float = knob(
+        0.0025,
+        "depths are not refined where the standard deviations of the cameras move pixels by more than this "
+        "share of the longer side: depths would make up for the cameras' errors",
+    )
     polish_sources: int = knob(2, "views whose depths each step of these refines")
     polish_smoothness: float = knob(
         0.1,

@@ -22,10 +22,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from tco.geometry import pixel_grid
 from tco.options import TCOConfig
 from tco.schedule import Sources, draw_targets
 from tco.terms import COMPATIBILITY, Terms, errors_at, means
-from tco.types import Cameras, Prediction, SparseDepth
+from tco.types import Cameras, Prediction, Priors, SparseDepth
 
 logger = logging.getLogger(__name__)
 
@@ -186,6 +187,32 @@ class _Polishing:
             views=tuple(chosen),
             stages=(),
         )
+
+
+def displacement(priors: Priors, size: tuple[int, int]) -> float:
+    """How far one standard deviation of its camera moves a pixel, in parts of the longer side.
+
+    Rotation moves it by f σ_R, the centre by f σ_c / d at the depth d of the view's points, the focal length
+    by σ_f times its distance from the principal point; the root of their squares, the mean over views. What
+    has no standard deviation is taken to be exact.
+
+    Args:
+        priors: of V views, with cameras.
+        size: height and width of the views, pixels.
+    """
+    assert priors.cameras is not None
+    K = priors.cameras.K
+    f = K[:, 0, 0]
+    radius = (pixel_grid(*size, like=K) - K[:, None, None, :2, 2]).norm(dim=-1).mean((1, 2))
+    moved = torch.zeros_like(f)
+    if priors.rotation_sigma is not None:
+        moved = moved + (f * priors.rotation_sigma) ** 2
+    if priors.centre_sigma is not None and priors.sparse is not None:
+        depths = [s.depth.median() if len(s) else s.depth.new_tensor(math.inf) for s in priors.sparse]
+        moved = moved + (f * priors.centre_sigma / torch.stack(depths).to(f)) ** 2
+    if priors.focal_sigma is not None:
+        moved = moved + (radius * priors.focal_sigma) ** 2
+    return float(moved.sqrt().mean()) / max(size)
 
 
 def _weights(terms: Terms, config: TCOConfig) -> dict[str, float]:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tco.optimize import optimize
 from tco.options import PolishConfig, TCOConfig
-from tco.polish import EDGE, DepthField, picture_edges, polish, roughness
+from tco.polish import EDGE, DepthField, displacement, picture_edges, polish, roughness
 from tco.terms import Terms
 from tco.toy import Toy, Wall, wall
 from tco.types import Prediction
@@ -250,3 +250,32 @@ def test_views_that_only_help_stay_as_they_are(scene: Wall) -> None:
     assert torch.equal(got.depth[2:], wrong.depth[2:])
     error, before = ((p.depth / scene.depth - 1).abs()[:2].mean() for p in (got, wrong))
     assert error < 0.7 * before
+
+
+def test_a_pixel_is_moved_by_each_uncertainty_of_its_camera(scene: Wall) -> None:
+    """By f σ_R, by f σ_c / d, by σ_f times its distance from the centre; as a share of the longer side."""
+    cameras, sparse = scene.priors.cameras, scene.priors.sparse
+    assert cameras is not None and sparse is not None
+    size, f = (48, 64), float(cameras.K[0, 0, 0])
+    one = torch.ones(4)
+    exact = replace(scene.priors, rotation_sigma=None, centre_sigma=None, focal_sigma=None)
+    assert displacement(exact, size) == 0
+    turned = displacement(replace(exact, rotation_sigma=0.01 * one), size)
+    assert turned == pytest.approx(0.01 * f / 64, rel=1e-5)
+    depth = [float(s.depth.median()) for s in sparse]
+    moved = displacement(replace(exact, centre_sigma=0.02 * one), size)
+    assert moved == pytest.approx(0.02 * f * sum(1 / d for d in depth) / 4 / 64, rel=1e-4)
+    zoomed = displacement(replace(exact, focal_sigma=0.03 * one), size)
+    assert 0.03 * 0.25 * 48 / 64 < zoomed < 0.03 * 0.5 * 80 / 64
+    both = replace(exact, rotation_sigma=0.01 * one, focal_sigma=0.03 * one)
+    assert displacement(both, size) == pytest.approx(math.hypot(turned, zoomed), rel=1e-4)
+
+
+def test_depths_do_not_make_up_for_uncertain_cameras(scene: Wall, caplog: pytest.LogCaptureFixture) -> None:
+    config = replace(CONFIG, steps=1, lora_targets=("plane",), polish=PolishConfig(polish_looks=1))
+    for sigma, looked in ((1e-4, True), (0.1, False)):
+        priors = replace(scene.priors, rotation_sigma=torch.full((4,), sigma))
+        with caplog.at_level(logging.WARNING):
+            outcome = optimize(Toy(), scene.views, priors, config)
+        assert (len(outcome.history) > 1) is looked
+        assert ("depths are not refined" in caplog.text) is not looked
