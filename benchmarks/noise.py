@@ -22,7 +22,7 @@ from benchmarks.real import RealSet, arguments, load, publish, within
 from colmap_tco.bench.noise import Noise
 from tco.backbones.weights import EMBEDDED, load_sweep
 from tco.optimize import Outcome, optimize
-from tco.options import AblationConfig, TCOConfig
+from tco.options import AblationConfig, PolishConfig, TCOConfig
 from tco.penalties import in_first_view, rotation_angle
 
 TABLE = (
@@ -34,9 +34,9 @@ TABLE = (
 )
 
 
-def ways(steps: int) -> dict[str, TCOConfig]:
+def ways(steps: int, polish: PolishConfig) -> dict[str, TCOConfig]:
     """The four ways to use uncertain cameras."""
-    plain = TCOConfig(steps=steps)
+    plain = TCOConfig(steps=steps, polish=polish)
     return {
         "network": replace(plain, steps=0),
         "held": replace(plain, camera_rate=0.0),
@@ -57,9 +57,12 @@ def main() -> None:
     parser = arguments(__doc__ or "")
     parser.set_defaults(sets=["kitchen", "livingroom"])
     parser.add_argument("--rows", type=int, nargs="+", default=range(len(TABLE)), help="rows of the table")
+    parser.add_argument(
+        "--polish_uncertainty", type=float, default=PolishConfig().polish_uncertainty, help="as of densify"
+    )
     args = parser.parse_args()
     network = load_sweep(args.weights or EMBEDDED)
-    configs = ways(args.steps)
+    configs = ways(args.steps, PolishConfig(polish_uncertainty=args.polish_uncertainty))
     head = [f"{name} {way}" for name in args.sets for way in configs]
     lines = [
         "# Noise in the camera priors\n",

@@ -106,10 +106,10 @@ def progress_told(result: Result, views: int) -> Iterator[None]:
         raise
 
 
-ENCODING, STEP, POLISHING = 1.0, 10.0, 0.35
+ENCODING, STEP, POLISHING = 1.3, 5.0, 0.2
 """What it takes to encode one view, to take one step on the network, and to look at one view in a step on the
-depths, in the seconds that decoding one view takes; measured for ``sweep`` on the pictures of
-``benchmarks/many.py``. They decide where the bar stands within a chunk, no more."""
+depths, in the seconds that decoding one view takes; of ``sweep`` on ``kitchen``, by a profile of ``densify``.
+They decide where the bar stands within a chunk, no more."""
 
 
 class Pace:

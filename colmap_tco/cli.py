@@ -66,16 +66,17 @@ def idle_threads_sleep() -> None:
 
     GNU's runtime lets a waiting thread spin for milliseconds. Where other programs want the cores too, each
     short parallel loop then waits for a thread that the system has stopped, and a run can take ten times as
-    long; threads that sleep at once cost a quarter of a run on an idle machine. The runtime reads the
-    variable when torch loads it, so this must come before.
+    long; threads that sleep at once have to be woken for each loop. The runtime reads the variable when torch
+    loads it, so this must come before.
     """
     if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & os.environ.keys():
         os.environ["GOMP_SPINCOUNT"] = SPINS
 
 
 SPINS = "1000"
-"""Turns of the loop in which a thread waits before it sleeps, some microseconds: with two programs beside it
-on two cores, a run took 26 s with these, 31 s without any, 73 s with 100,000; alone 13, 16 and 13 s."""
+"""Turns of the loop in which a thread waits before it sleeps, some microseconds. With none, an idle machine
+waits for threads to wake; with many, a busy one waits for threads that only wait. ``GOMP_SPINCOUNT`` in the
+environment takes others, to compare."""
 
 
 def exit_code(error: BaseException) -> int:

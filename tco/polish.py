@@ -193,8 +193,8 @@ def displacement(priors: Priors, size: tuple[int, int]) -> float:
     """How far one standard deviation of its camera moves a pixel, in parts of the longer side.
 
     Rotation moves it by f σ_R, the centre by f σ_c / d at the depth d of the view's points, the focal length
-    by σ_f times its distance from the principal point; the root of their squares, the mean over views. What
-    has no standard deviation is taken to be exact.
+    by σ_f times its distance from the principal point; the root of their squares, the median
+    over views, so that a few with hardly a point do not decide. What has no standard deviation is exact.
 
     Args:
         priors: of V views, with cameras.
@@ -212,7 +212,7 @@ def displacement(priors: Priors, size: tuple[int, int]) -> float:
         moved = moved + (f * priors.centre_sigma / torch.stack(depths).to(f)) ** 2
     if priors.focal_sigma is not None:
         moved = moved + (radius * priors.focal_sigma) ** 2
-    return float(moved.sqrt().mean()) / max(size)
+    return float(moved.sqrt().median()) / max(size)
 
 
 def _weights(terms: Terms, config: TCOConfig) -> dict[str, float]:

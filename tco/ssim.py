@@ -2,8 +2,8 @@
 
 Z. Wang et al., Image quality assessment, IEEE TIP 2004: local means, variances and covariance under a
 Gaussian window of standard deviation 1.5, of the image reflected at its borders. The windows are filtered by
-OpenCV on the CPU, where torch's convolution of single channels takes ten times as long, and by kornia
-elsewhere.
+OpenCV on the CPU, where torch's convolution of single channels takes many times as long
+(``benchmarks/ssim.py``), and by kornia elsewhere.
 """
 
 from __future__ import annotations

@@ -45,9 +45,10 @@ class CameraHead(nn.Module):
         poses: list[Tensor] = []
         pose = self.empty_pose_tokens.expand(*tokens.shape[:2], -1)
         for k in range(iterations):
-            shift, scale, gate = self.poseLN_modulation(self.embed_pose(pose.detach() if k else pose)).chunk(
-                3, -1
-            )
+            if k:
+                # As published: each iteration answers for its own change alone.
+                pose = pose.detach()
+            shift, scale, gate = self.poseLN_modulation(self.embed_pose(pose)).chunk(3, -1)
             x = tokens + gate * (plain * (1 + scale) + shift)
             for block in self.trunk:
                 x = block(x)

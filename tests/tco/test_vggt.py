@@ -13,6 +13,7 @@ from tco.backbones.dinov2 import ViTConfig
 from tco.backbones.transformer import rotary
 from tco.backbones.vggt import VGGT, VGGTConfig, VGGTNetwork
 from tco.backbones.vggt_heads import (
+    CameraHead,
     Fusion,
     cam_from_world,
     cameras,
@@ -194,6 +195,16 @@ def test_adapters_reach_the_decoder_and_not_the_encoder(backbone: VGGT) -> None:
         for name in backbone.network.state_dict()
         if name.startswith(("aggregator.frame_blocks.", "aggregator.global_blocks."))
     }
+
+
+def test_each_iteration_of_the_cameras_answers_for_its_own_change_alone() -> None:
+    """The published head cuts what came before, in the sum too: of a bias that all add, the last counts."""
+    torch.manual_seed(0)
+    head = CameraHead(32, 4, 1)
+    poses = head(torch.randn(3, 32), iterations=4)
+    for pose in poses:
+        (grad,) = torch.autograd.grad(pose[:, :7].sum(), head.pose_branch.fc2.bias, retain_graph=True)
+        torch.testing.assert_close(grad[:7], torch.full((7,), 3.0))
 
 
 def test_encoded_poses_become_cameras() -> None:
