@@ -209,7 +209,7 @@ def test_a_pool_draws_as_many_scenes_as_the_pixels_allow_and_grows(data: Path) -
 
 
 def test_a_network_learns_two_scenes(data: Path) -> None:
-    """In a hundred steps the camera loss falls below half, the error of depth below 0.7, the total below 0.6."""
+    """After 100 steps the camera loss is below half, the error of depth below 0.7, the total below 0.6."""
     batch = gathered([hold(data / f"00000{k}.npz", (32, 48), CPU) for k in (1, 2)], [range(3)] * 2, (32, 48))
     network = fresh(TINY)
     optimiser = torch.optim.AdamW(network.parameters(), 2e-3)
