@@ -23,7 +23,7 @@ from colmap_tco.progress import Progress
 from colmap_tco.resume import Result
 from colmap_tco.tracks import Covisibility, Tracks
 from colmap_tco.views import View
-from tco.options import TCOConfig
+from tco.options import ConsensusConfig, TCOConfig
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +49,7 @@ class Means(NamedTuple):
 
 def predict_chunks(
     result: Result, scene: Scene, plan: ChunkPlan, means: Means,
-    settings: tuple[PriorConfig, TCOConfig, int], progress: Progress,
+    settings: tuple[PriorConfig, TCOConfig, ConsensusConfig, int], progress: Progress,
 ) -> dict[str, str]:  # fmt: skip
     """Optimise the chunks that are not finished yet and write the maps of their views.
 
@@ -149,7 +149,8 @@ def _write_chunk(
     for view in owned:
         r = done.views[view.name]
         maps, filled = fill(existing, view, r.maps) if existing else (r.maps, {})
-        outputs.write_maps(result.paths, view.name, maps)
+        own = fill(existing, view, r.own)[0] if existing else r.own
+        outputs.write_maps(result.paths, view.name, maps, own)
         camera = r.corrected.camera
         told: Any = outputs.plain({**r.figures, **filled})
         # Rounded like the figures of the report, a camera in map coordinates would be metres off.

@@ -35,7 +35,7 @@ from colmap_tco.tracks import Covisibility, Tracks, covisibility, read_tracks
 from colmap_tco.views import View, ViewConfig, make_views
 from colmap_tco.workspace import Workspace, WorkspaceConfig, existing_root, open_workspace
 from tco.config import knob
-from tco.options import TCOConfig
+from tco.options import ConsensusConfig, TCOConfig
 
 log = logging.getLogger(__name__)
 
@@ -57,6 +57,7 @@ class DensifyConfig:
     )
     network: NetworkConfig = field(default_factory=NetworkConfig)
     tco: TCOConfig = field(default_factory=TCOConfig)
+    consensus: ConsensusConfig = field(default_factory=ConsensusConfig)
     views: ViewConfig = field(default_factory=ViewConfig)
     priors: PriorConfig = field(default_factory=PriorConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
@@ -161,7 +162,7 @@ def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified
     skipped = {**workspace.skipped, **skipped, **blind, **alone}
     with clock("optimisation"), _threads(config.num_threads):
         means = Means(chosen, budget, existing)
-        settings = (config.priors, config.tco, config.seed)
+        settings = (config.priors, config.tco, config.consensus, config.seed)
         failed = predict_chunks(result, Scene(tracks, views, pairs), plan, means, settings, progress)
     used = _used(result, views, config.refine_cameras)
     if not used:

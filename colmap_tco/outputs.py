@@ -51,7 +51,7 @@ class ViewMaps:
 
 
 def write_view(paths: DensePaths, view: View, maps: ViewMaps) -> None:
-    """Write the undistorted image and the three maps of a view.
+    """Write the undistorted image and the maps of a view.
 
     Raises:
         InputError: the image cannot be read.
@@ -62,8 +62,15 @@ def write_view(paths: DensePaths, view: View, maps: ViewMaps) -> None:
     write_maps(paths, view.name, maps)
 
 
-def write_maps(paths: DensePaths, name: str, maps: ViewMaps) -> None:
-    """Write the three maps of a view.
+def write_maps(paths: DensePaths, name: str, maps: ViewMaps, own: ViewMaps | None = None) -> None:
+    """Write the maps of a view.
+
+    Args:
+        paths: the dense workspace.
+        name: of the view.
+        maps: the result; COLMAP's geometric maps.
+        own: what the view said before the others were asked, which fusion takes as independent evidence;
+            COLMAP's photometric maps. By default the same.
 
     Raises:
         ValueError: a map holds a value that is not finite.
@@ -71,6 +78,9 @@ def write_maps(paths: DensePaths, name: str, maps: ViewMaps) -> None:
     write_map(paths.depth_map(name), maps.depth)
     write_map(paths.normal_map(name), maps.normal)
     write_map(paths.confidence_map(name), maps.confidence)
+    own = own or maps
+    for path, array in zip(paths.own_maps(name), (own.depth, own.normal), strict=True):
+        write_map(path, array)
 
 
 def write_image(path: Path, image: NDArray[np.uint8]) -> None:
@@ -239,14 +249,15 @@ def reaches(tracks: Tracks, views: Sequence[View]) -> dict[str, float]:
 
 
 def read_view(paths: DensePaths, name: str) -> FusionMaps:
-    """The image and maps of a view as :func:`write_view` wrote them.
+    """The image of a view and its own maps, as :func:`write_view` and :func:`write_maps` wrote them.
 
     Raises:
         InputError: a file is missing or damaged.
     """
+    depth, normal = (read_map(path) for path in paths.own_maps(name))
     return FusionMaps(
-        depth=read_map(paths.depth_map(name)),
-        normal=read_map(paths.normal_map(name)),
+        depth=depth,
+        normal=normal,
         image=read_image(paths.image(name)),
         confidence=read_map(paths.confidence_map(name)),
     )

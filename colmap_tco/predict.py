@@ -15,7 +15,7 @@ from colmap_tco.outputs import ViewMaps
 from colmap_tco.priors import PriorConfig, build_priors, check_projection, chunk_frame
 from colmap_tco.tracks import Tracks
 from colmap_tco.views import Picture, View, batch, crop, network_image
-from tco.options import TCOConfig
+from tco.options import ConsensusConfig, TCOConfig
 
 if TYPE_CHECKING:
     import torch
@@ -34,11 +34,13 @@ class ViewResult:
 
     Attributes:
         maps: depth, normals and confidence at the size of ``view.network``, in COLMAP units.
+        own: the same before the views were asked what they say together.
         figures: numbers for the report.
         corrected: the view with its corrected camera.
     """
 
     maps: ViewMaps
+    own: ViewMaps
     figures: dict[str, object]
     corrected: View
 
@@ -64,7 +66,7 @@ def predict_chunk(
     tracks: Tracks,
     views: Sequence[View],
     chunk: Chunk,
-    settings: tuple[PriorConfig, TCOConfig, int],
+    settings: tuple[PriorConfig, TCOConfig, ConsensusConfig, int],
     report: Callable[[dict[str, float]], None],
     picture: Callable[[View], Picture] = network_image,
 ) -> ChunkResult:
@@ -75,7 +77,7 @@ def predict_chunk(
         tracks: of the model.
         views: all views of the workspace; the chunk's indices refer to them.
         chunk: owned and context views.
-        settings: of priors and optimisation, and the seed.
+        settings: of priors, optimisation and consensus, and the seed.
         report: called with the terms of each step.
         picture: makes the picture of a view for the network.
 
@@ -83,26 +85,29 @@ def predict_chunk(
         InputError: the points do not project where the keypoints are, or an image cannot be read.
     """
     from tco.align import KnownCameras
+    from tco.consensus import agreed
     from tco.optimize import errors_at_points, optimize
 
-    (backbone, device), (prior_config, tco_config, seed) = network, settings
+    (backbone, device), (prior_config, tco_config, consensus, seed) = network, settings
     aligned = None if backbone.uses_cameras else KnownCameras(backbone)
     members = [views[i] for i in chunk.views]
     frame = chunk_frame(tracks, members)
     images, cameras = batch(members, frame, picture, len(chunk.context))
     check = check_projection(tracks, members, frame, cameras)
     priors = build_priors(tracks, members, frame, prior_config, seed)
+    there = images.to(device)
     outcome = optimize(
         aligned or backbone,
-        images.to(device),
+        there,
         priors.optimise.to(device),
         tco_config,
         seed,
         lambda _, terms: report(terms),
         watched=[points.to(device) for points in priors.held_out],
     )
-    prediction, moved = outcome.prediction.to("cpu"), outcome.cameras.to("cpu")
-    assert priors.optimise.sparse is not None
+    assert priors.optimise.sparse is not None and priors.optimise.overlap is not None
+    together = agreed(outcome.prediction, outcome.cameras, there, priors.optimise.overlap, consensus)
+    own, prediction, moved = outcome.prediction.to("cpu"), together.to("cpu"), outcome.cameras.to("cpu")
     used = errors_at_points(prediction, priors.optimise.sparse)
     held = errors_at_points(prediction, priors.held_out)
     results = {}
@@ -119,15 +124,15 @@ def predict_chunk(
             "error_of_one_depth": _error_of_one_depth(priors.optimise.sparse[i].depth),
             "reprojection_error_pixels": check.per_view.get(view.name),
             "correction": _correction(outcome, i, frame.scale),
+            "moved_by_consensus": float((prediction.depth[i] / own.depth[i]).log().abs().median()),
         }
         corrected = corrected_view(view, frame.scale, cameras, moved, i)
-        results[view.name] = ViewResult(
-            view_maps(view, prediction, i, images.valid, frame.scale), figures, corrected
-        )
+        maps, before = (view_maps(view, p, i, images.valid, frame.scale) for p in (prediction, own))
+        results[view.name] = ViewResult(maps, before, figures, corrected)
     if aligned is not None:
-        own = aligned.history
         steps = [
-            terms | {f"own_{k}": v for k, v in more.items()} for terms, more in _paired(outcome.history, own)
+            terms | {f"own_{k}": v for k, v in more.items()}
+            for terms, more in _paired(outcome.history, aligned.history)
         ]
         return ChunkResult(results, steps, aligned.agreement)
     return ChunkResult(results, outcome.history, {})

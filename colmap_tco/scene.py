@@ -3,6 +3,7 @@
     scene = open_scene(Path("workspace"))
     outcome = optimize(load_sweep(), scene.views, scene.priors)
     cloud, report = scene.fuse(outcome.prediction)
+    maps = scene.maps(scene.agreed(outcome.prediction, outcome.cameras))
 
 For experiments on scenes that fit the memory. ``colmap_tco.densify`` does the same in chunks, writes files,
 and goes on after an interruption.
@@ -26,11 +27,12 @@ from colmap_tco.priors import PriorConfig, build_priors, chunk_frame, with_point
 from colmap_tco.tracks import Tracks, covisibility, read_tracks
 from colmap_tco.views import ChunkFrame, View, ViewConfig, batch, make_views, undistorted_image
 from colmap_tco.workspace import open_workspace
+from tco.options import ConsensusConfig
 
 if TYPE_CHECKING:
     from colmap_tco._pycolmap import Floats
     from colmap_tco.fusion_report import FusionReport
-    from tco.types import Prediction, Priors, SparseDepth, Views
+    from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
 
 
 @dataclass(frozen=True)
@@ -58,10 +60,32 @@ class Scene:
         scale, valid = self.frame.scale, self.views.valid
         return [view_maps(view, prediction, i, valid, scale) for i, view in enumerate(self.images)]
 
+    def agreed(
+        self,
+        prediction: Prediction,
+        cameras: Cameras | None = None,
+        config: ConsensusConfig = ConsensusConfig(),
+    ) -> Prediction:
+        """What the V views say together of the depths: what ``densify`` writes as maps.
+
+        Args:
+            prediction: of all V views, each by itself.
+            cameras: where they stand; by default as in the priors, ``Outcome.cameras`` knows better.
+            config: settings.
+        """
+        from tco.consensus import agreed
+
+        cameras = cameras or self.priors.cameras
+        assert cameras is not None and self.priors.overlap is not None
+        return agreed(prediction, cameras, self.views, self.priors.overlap, config)
+
     def fuse(
         self, prediction: Prediction, config: FusionConfig = FusionConfig()
     ) -> tuple[Cloud, FusionReport]:
         """The cloud of a prediction of all V views, in COLMAP's frame.
+
+        Fusion asks how many views found the same by themselves: give it what optimisation gives, not what
+        :meth:`agreed` makes of that.
 
         Raises:
             EmptyCloudError: no point is left; the message names the filter that removed most.

@@ -97,12 +97,18 @@ class DensePaths:
         return self.images / name
 
     def depth_map(self, name: str) -> Path:
-        """The depth map of an image, in COLMAP's matrix format."""
+        """The depth map of an image that agrees with the others', in COLMAP's matrix format."""
         return self.stereo / "depth_maps" / f"{name}.geometric.bin"
 
     def normal_map(self, name: str) -> Path:
         """The normal map of an image, in COLMAP's matrix format."""
         return self.stereo / "normal_maps" / f"{name}.geometric.bin"
+
+    def own_maps(self, name: str) -> tuple[Path, Path]:
+        """Depth and normal map from before the other images were asked, which COLMAP calls photometric."""
+        folders = ("depth_maps", "normal_maps")
+        depth, normal = (self.stereo / folder / f"{name}.photometric.bin" for folder in folders)
+        return depth, normal
 
     def confidence_map(self, name: str) -> Path:
         """The confidence of the depth map, in the same format; COLMAP ignores the folder."""

@@ -25,8 +25,9 @@ from colmap_tco.tracks import covisibility, read_tracks
 from colmap_tco.views import ViewConfig, batch, make_views
 from colmap_tco.workspace import open_workspace
 from tco.backbones.weights import load_sweep
+from tco.consensus import agreed
 from tco.optimize import errors_at_points, optimize
-from tco.options import TCOConfig
+from tco.options import ConsensusConfig, TCOConfig
 
 
 def reconstruct(root: Path, size: int, config: TCOConfig) -> tuple[Cloud, dict[str, ViewMaps], torch.Tensor]:
@@ -49,16 +50,23 @@ def reconstruct(root: Path, size: int, config: TCOConfig) -> tuple[Cloud, dict[s
 
     # Test-time optimisation. The network is as before when this returns; steps=0 would leave it alone.
     outcome = optimize(network, views, priors.optimise, config)
-    errors = torch.cat(errors_at_points(outcome.prediction, priors.held_out))
+
+    # Consensus: each pixel's depth by what all views that see the place say of it.
+    assert priors.optimise.overlap is not None
+    together = agreed(outcome.prediction, outcome.cameras, views, priors.optimise.overlap, ConsensusConfig())
+    errors = torch.cat(errors_at_points(together, priors.held_out))
 
     # Back to COLMAP's units, with a normal for each depth.
-    maps = [view_maps(v, outcome.prediction, i, views.valid, frame.scale) for i, v in enumerate(images)]
+    own, maps = (
+        [view_maps(v, prediction, i, views.valid, frame.scale) for i, v in enumerate(images)]
+        for prediction in (outcome.prediction, together)
+    )
 
-    # Fusion: what several views agree on, coloured from the full images.
+    # Fusion: what several views found each by itself, coloured from the full images.
     neighbours = source_views(covisibility(tracks, [view.image_id for view in images]), 50)
-    cloud, report = fuse(fusion_views(images, maps, neighbours, tracks))
+    cloud, report = fuse(fusion_views(images, own, neighbours, tracks))
     print({name: count for name, count in report.pixels.items() if count})
-    return cloud, {view.name: own for view, own in zip(images, maps, strict=True)}, errors
+    return cloud, {view.name: result for view, result in zip(images, maps, strict=True)}, errors
 
 
 def main() -> None:

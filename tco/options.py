@@ -96,6 +96,34 @@ class PolishConfig:
 
 
 @dataclass(frozen=True)
+class ConsensusConfig:
+    """What the views say together (``tco/consensus.py``): no optimisation, and without steps, too."""
+
+    consensus_rounds: int = knob(
+        2,
+        "times that each pixel's depth is moved to the weighted median of what the views say of it, each "
+        "with its own depths; 0: the depths of a view are its own alone",
+    )
+    consensus_views: int = knob(20, "views that a pixel asks, those that share the most points")
+    consensus_reach: float = knob(
+        0.2,
+        "largest logarithm of the ratio of two depths that are taken for the same surface; lower it where "
+        "thin things stand close before others",
+    )
+    consensus_width: float = knob(
+        0.01,
+        "logarithms this far from the median count half in the mean that is taken around it; the depths' "
+        "noise, not their errors",
+    )
+
+    def __post_init__(self) -> None:
+        if self.consensus_rounds < 0 or self.consensus_views < 1:
+            raise ValueError("consensus_rounds must not be negative, and consensus_views at least 1")
+        if not (self.consensus_reach > 0 and self.consensus_width > 0):
+            raise ValueError("consensus_reach and consensus_width must be positive")
+
+
+@dataclass(frozen=True)
 class TCOConfig:
     """Test-time constrained optimisation (Zhou et al., arXiv 2604.03878)."""
 

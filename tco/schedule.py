@@ -59,6 +59,13 @@ def draw_targets(overlap: Tensor, source: int, count: int, generator: torch.Gene
     return torch.multinomial(odds, count, generator=generator).tolist() if count else []
 
 
+def most_overlapping(overlap: Tensor, view: int, count: int) -> list[int]:
+    """At most ``count`` other views, those that share most with ``view`` first; none that shares nothing."""
+    shared = overlap[view].detach().cpu().tolist()
+    others = [other for other in range(len(shared)) if other != view and shared[other] > 0]
+    return sorted(others, key=lambda other: -shared[other])[:count]
+
+
 class Stagnation:
     """Tells when an error that is measured on one view after another stops falling.
 

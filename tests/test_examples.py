@@ -104,9 +104,9 @@ def test_python_api_gives_what_densify_writes(densified: tuple[Room, str]) -> No
     paths = dense_paths(room.root)
     cloud, maps, errors = python_api.reconstruct(room.root, SIZE, TCOConfig(steps=STEPS))
     assert set(maps) == set(room.names)
-    for name, own in maps.items():
-        np.testing.assert_allclose(own.depth, read_map(paths.depth_map(name)), rtol=1e-4)
-        np.testing.assert_allclose(own.confidence, read_map(paths.confidence_map(name)), rtol=1e-3)
+    for name, ours in maps.items():
+        np.testing.assert_allclose(ours.depth, read_map(paths.depth_map(name)), rtol=1e-4)
+        np.testing.assert_allclose(ours.confidence, read_map(paths.confidence_map(name)), rtol=1e-3)
     points, _, _ = read_ply(paths.ply)
     assert len(cloud) == pytest.approx(len(points), rel=0.01)
     assert float(errors.abs().median()) < 0.03

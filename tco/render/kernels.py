@@ -35,7 +35,7 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 Array = np.ndarray[Any, Any]
 
 
-def _compiled(function: _F) -> _F:
+def compiled(function: _F) -> _F:
     """``function`` as machine code, kept on disk between runs where a folder for that can be written."""
     try:
         return numba.njit(nogil=True, cache=True, error_model="numpy")(function)
@@ -102,7 +102,7 @@ def _carry(grad: Any, columns: Any, corner: Any, by_zeta: Any) -> None:
         grad[3 * k], grad[3 * k + 1], grad[3 * k + 2] = dX[k], dY[k], dW[k]
 
 
-@_compiled
+@compiled
 def composite(splats: Array, boxes: Array, image: Array) -> None:
     """Splats (N, 16), front first, into ``image`` (H, W, 5): colours, depth, transmittance from 1 down.
 
@@ -134,7 +134,7 @@ def composite(splats: Array, boxes: Array, image: Array) -> None:
                 pixel[4] = after
 
 
-@_compiled
+@compiled
 def composite_backward(splats: Array, boxes: Array, upstream: Array, rest: Array, grads: Array) -> None:
     """Derivatives of :func:`composite`, written to ``grads`` (N, 16), which starts at zero.
 
@@ -188,7 +188,7 @@ def composite_backward(splats: Array, boxes: Array, upstream: Array, rest: Array
         _carry(grad, _columns(row, box), (box[0], box[2]), (g0, gx, gy))
 
 
-@_compiled
+@compiled
 def nearest(splats: Array, boxes: Array, depth: Array) -> None:
     """Lower ``depth`` (H, W), infinite at first, to that of the nearest splat whose core holds the pixel."""
     for row, box in zip(splats, boxes):  # noqa: B905 (numba knows no strict)
@@ -202,7 +202,7 @@ def nearest(splats: Array, boxes: Array, depth: Array) -> None:
                         depth[box[2] + y, box[0] + x] = row[11]
 
 
-@_compiled
+@compiled
 def blend(splats: Array, boxes: Array, surface: Array, tolerance: float, image: Array) -> None:
     """Add splats (N, 16) of the nearest surface to ``image`` (H, W, 5): colours, depth and weight.
 
@@ -228,7 +228,7 @@ def blend(splats: Array, boxes: Array, surface: Array, tolerance: float, image: 
                     pixel[4] += weight
 
 
-@_compiled
+@compiled
 def blend_backward(
     splats: Array, boxes: Array, surface: Array, tolerance: float, upstream: Array, grads: Array
 ) -> None:

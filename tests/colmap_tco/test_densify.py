@@ -26,13 +26,14 @@ from colmap_tco.densify import Densified, DensifyConfig, densify
 from colmap_tco.errors import InputError, PartlyDoneError
 from colmap_tco.lock import locked
 from colmap_tco.maps import read_map
+from colmap_tco.outputs import read_view
 from colmap_tco.ply import read_ply, read_vis
 from colmap_tco.priors import PriorConfig, held_out
 from colmap_tco.progress import Progress
 from colmap_tco.tracks import covisibility, read_tracks
 from colmap_tco.views import ViewConfig
-from colmap_tco.workspace import open_workspace
-from tco.options import PolishConfig, TCOConfig
+from colmap_tco.workspace import DensePaths, open_workspace
+from tco.options import ConsensusConfig, PolishConfig, TCOConfig
 
 if TYPE_CHECKING:
     from tests.conftest import Room
@@ -118,6 +119,8 @@ def test_the_result_is_complete(done: Done) -> None:
     expected = {f"images/{name}" for name in names}
     for kind in ("depth", "normal", "confidence"):
         expected |= {f"stereo/{kind}_maps/{name}.geometric.bin" for name in names}
+    for kind in ("depth", "normal"):
+        expected |= {f"stereo/{kind}_maps/{name}.photometric.bin" for name in names}
     expected |= {"fused.ply", "fused.ply.vis", "report.json", "report.html", "manifest.json"}
     expected |= {"stereo/fusion.cfg", "stereo/patch-match.cfg"}
     found = {path.relative_to(done.dense).as_posix() for path in done.dense.rglob("*") if path.is_file()}
@@ -358,6 +361,32 @@ def test_pictures_that_are_not_in_the_model_are_named_and_harm_nothing(fresh_roo
     }  # fmt: skip
     assert "did not register" in report["views"]["new.png"]["why"]
     assert f"registered it in {smaller}" in report["views"][name]["why"]
+
+
+def test_maps_are_nearer_to_the_truth_after_the_views_were_asked(done: Done) -> None:
+    """Median errors of a view's own map and of the one that agrees with the others, and of the cloud's source."""
+    room, paths = done.room, DensePaths(done.dense)
+    errors = []
+    for i, name in enumerate(room.names):
+        own, together = read_map(paths.own_maps(name)[0]), read_map(paths.depth_map(name))
+        assert read_view(paths, name).depth.tobytes() == own.tobytes()
+        known = truth(room, i, own.shape)
+        errors.append([np.median(np.abs(depth / known - 1)) for depth in (own, together)])
+        told = done.result.report["views"][name]["moved_by_consensus"]
+        assert told == pytest.approx(float(np.median(np.abs(np.log(together / own)))), rel=1e-4)
+        assert told > 0
+    before, after = np.mean(errors, axis=0)
+    assert after < 0.95 * before
+
+
+def test_views_that_are_not_asked_keep_their_own_maps(fresh_room: Room) -> None:
+    alone = replace(config(steps=0), consensus=ConsensusConfig(consensus_rounds=0))
+    paths = DensePaths(made(fresh_room.root, alone).folder)
+    for name in fresh_room.names:
+        for own, together in zip(
+            paths.own_maps(name), (paths.depth_map(name), paths.normal_map(name)), strict=True
+        ):
+            assert own.read_bytes() == together.read_bytes()
 
 
 def test_other_settings_of_the_fusion_keep_the_depth_maps(fresh_room: Room) -> None:
