@@ -51,6 +51,11 @@ def load(name: str, size: int, count: int = 0, stride: int = 16) -> RealSet:
     root = SHARED / name
     if not root.is_dir():
         sys.exit(f"{root} is not there: this measurement needs the shared real sets")
+    return load_from(root, name, size, count, stride)
+
+
+def load_from(root: Path, name: str, size: int, count: int = 0, stride: int = 16) -> RealSet:
+    """As :func:`load`, of a workspace anywhere that has its truth beside it, as the shared sets have."""
     workspace = open_workspace(root)
     views, _ = make_views(workspace, ViewConfig(max_image_size=size), stride)
     views = views[: count or len(views)]
@@ -87,7 +92,7 @@ def median_error(prediction: Prediction, truth: Tensor) -> float:
 def arguments(description: str, sets: tuple[str, ...] = SETS) -> argparse.ArgumentParser:
     """A parser with what all measurements share: sets, size, views, steps, weights and where to write."""
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
-    parser.add_argument("--sets", nargs="+", default=list(sets), choices=SETS)
+    parser.add_argument("--sets", nargs="+", default=list(sets), choices=sets)
     parser.add_argument("--size", type=int, default=192, help="longer side of the views, pixels")
     parser.add_argument("--views", type=int, default=8, help="views of each set; 0 is all")
     parser.add_argument("--steps", type=int, default=24)
