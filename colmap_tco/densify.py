@@ -1,6 +1,6 @@
 """The product: COLMAP workspace in, dense workspace out.
 
-workspace → views, priors → chunks → tco.optimize(backbone) → Prediction → fusion → outputs
+workspace → views, priors → chunks → tco.optimize(backbone) → Prediction → consensus, fusion → outputs
 """
 
 from __future__ import annotations
