@@ -102,7 +102,7 @@ def scale_shift(source: Tensor, target: Tensor, mask: Tensor) -> tuple[Tensor, T
         raise ValueError(f"scale and shift need two depths, the mask holds {x.numel()}")
     mx, my = x.mean(), y.mean()
     variance = ((x - mx) ** 2).sum()
-    if float(variance) <= 1e-12 * float((x * x).sum()):
+    if float(variance.detach()) <= 1e-12 * float((x * x).sum().detach()):
         raise ValueError("scale and shift are undefined: the source depth is constant")
     s = ((x - mx) * (y - my)).sum() / variance
     return s, my - s * mx
