@@ -32,7 +32,7 @@ def variants() -> Iterator[tuple[str, ConsensusConfig]]:
         yield f"{rounds} rounds", replace(plain, consensus_rounds=rounds)
     for views in (2, 4, 8):
         yield f"{views} views asked", replace(plain, consensus_views=views)
-    for reach in (0.05, 0.1, 0.4):
+    for reach in (0.05, 0.1, 0.2, 0.4):
         yield f"reach {reach}", replace(plain, consensus_reach=reach)
     for width in (1e-4, 0.003, 0.03):
         yield f"width {width}", replace(plain, consensus_width=width)
@@ -40,10 +40,8 @@ def variants() -> Iterator[tuple[str, ConsensusConfig]]:
 
 def cell(real: RealSet, outcome: Outcome, config: ConsensusConfig) -> str:
     """Shares within 2 and 5 %, median error and seconds of the consensus."""
-    overlap = real.given.overlap
-    assert overlap is not None
     start = time.process_time()
-    together = agreed(outcome.prediction, outcome.cameras, real.views, overlap, config)
+    together = agreed(outcome.prediction, outcome.cameras, real.views, real.given, config)
     seconds = time.process_time() - start
     near, close = within(together, real.truth, 0.02), within(together, real.truth)
     return f"{near:.3f} {close:.3f} {100 * median_error(together, real.truth):.2f} % {seconds:.1f} s"

@@ -21,8 +21,9 @@ from dataclasses import replace
 from benchmarks.real import RealSet, arguments, load, publish, within
 from colmap_tco.bench.noise import Noise
 from tco.backbones.weights import EMBEDDED, load_sweep
+from tco.consensus import agreed
 from tco.optimize import Outcome, optimize
-from tco.options import AblationConfig, PolishConfig, TCOConfig
+from tco.options import AblationConfig, ConsensusConfig, PolishConfig, TCOConfig
 from tco.penalties import in_first_view, rotation_angle
 
 TABLE = (
@@ -60,10 +61,16 @@ def main() -> None:
     parser.add_argument(
         "--polish_uncertainty", type=float, default=PolishConfig().polish_uncertainty, help="as of densify"
     )
+    parser.add_argument(
+        "--consensus_uncertainty",
+        type=float,
+        default=ConsensusConfig().consensus_uncertainty,
+        help="as of densify",
+    )
     args = parser.parse_args()
     network = load_sweep(args.weights or EMBEDDED)
     configs = ways(args.steps, PolishConfig(polish_uncertainty=args.polish_uncertainty))
-    head = [f"{name} {way}" for name in args.sets for way in configs]
+    head = [f"{name} {way}" for name in args.sets for way in (*configs, "agreed")]
     lines = [
         "# Noise in the camera priors\n",
         f"`python -m benchmarks.noise`: {args.views or 'all'} views of {args.size} pixels, {args.steps} "
@@ -82,6 +89,9 @@ def main() -> None:
                 cells.append(
                     f"{within(outcome.prediction, real.truth):.3f} ({rotation_error(outcome, real):.2f})"
                 )
+            asking = ConsensusConfig(consensus_uncertainty=args.consensus_uncertainty)
+            together = agreed(outcome.prediction, outcome.cameras, real.views, noisy, asking)
+            cells.append(f"{within(together, real.truth):.3f}")
         lines.append(f"| {TABLE[row]} | " + " | ".join(cells) + " |")
         if args.output is None:
             publish(lines[-1] + "\n", None)

@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
-import os
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -92,7 +91,7 @@ def main() -> None:
         missing += [
             f"{views - count} of {kind}"
             for kind in ("depth_maps", "normal_maps")
-            if (count := len(os.listdir(dense / "stereo" / kind))) != views
+            if (count := len(list((dense / "stereo" / kind).glob("*.geometric.bin")))) != views
         ]
         out.write(
             f"| {network} | {done.code} | {done.seconds:.0f} | {done.peak:.1f} | {len(report['chunks'])} "

@@ -105,8 +105,8 @@ def predict_chunk(
         lambda _, terms: report(terms),
         watched=[points.to(device) for points in priors.held_out],
     )
-    assert priors.optimise.sparse is not None and priors.optimise.overlap is not None
-    together = agreed(outcome.prediction, outcome.cameras, there, priors.optimise.overlap, consensus)
+    assert priors.optimise.sparse is not None
+    together = agreed(outcome.prediction, outcome.cameras, there, priors.optimise, consensus)
     own, prediction, moved = outcome.prediction.to("cpu"), together.to("cpu"), outcome.cameras.to("cpu")
     used = errors_at_points(prediction, priors.optimise.sparse)
     held = errors_at_points(prediction, priors.held_out)
@@ -124,11 +124,10 @@ def predict_chunk(
             "error_of_one_depth": _error_of_one_depth(priors.optimise.sparse[i].depth),
             "reprojection_error_pixels": check.per_view.get(view.name),
             "correction": _correction(outcome, i, frame.scale),
-            "moved_by_consensus": float((prediction.depth[i] / own.depth[i]).log().abs().median()),
         }
         corrected = corrected_view(view, frame.scale, cameras, moved, i)
         maps, before = (view_maps(view, p, i, images.valid, frame.scale) for p in (prediction, own))
-        results[view.name] = ViewResult(maps, before, figures, corrected)
+        results[view.name] = ViewResult(maps, before, figures | _moved(before, maps), corrected)
     if aligned is not None:
         steps = [
             terms | {f"own_{k}": v for k, v in more.items()}
@@ -136,6 +135,13 @@ def predict_chunk(
         ]
         return ChunkResult(results, steps, aligned.agreement)
     return ChunkResult(results, outcome.history, {})
+
+
+def _moved(before: ViewMaps, after: ViewMaps) -> dict[str, float | None]:
+    """By how much, relative, the other views moved the depths of a view."""
+    known = (before.depth > 0) & (after.depth > 0)
+    moved = np.abs(np.log(after.depth[known] / before.depth[known]))
+    return {"moved_by_consensus": float(np.median(moved)) if moved.size else None}
 
 
 def _paired(

@@ -76,8 +76,8 @@ class Scene:
         from tco.consensus import agreed
 
         cameras = cameras or self.priors.cameras
-        assert cameras is not None and self.priors.overlap is not None
-        return agreed(prediction, cameras, self.views, self.priors.overlap, config)
+        assert cameras is not None
+        return agreed(prediction, cameras, self.views, self.priors, config)
 
     def fuse(
         self, prediction: Prediction, config: FusionConfig = FusionConfig()

@@ -52,8 +52,7 @@ def reconstruct(root: Path, size: int, config: TCOConfig) -> tuple[Cloud, dict[s
     outcome = optimize(network, views, priors.optimise, config)
 
     # Consensus: each pixel's depth by what all views that see the place say of it.
-    assert priors.optimise.overlap is not None
-    together = agreed(outcome.prediction, outcome.cameras, views, priors.optimise.overlap, ConsensusConfig())
+    together = agreed(outcome.prediction, outcome.cameras, views, priors.optimise, ConsensusConfig())
     errors = torch.cat(errors_at_points(together, priors.held_out))
 
     # Back to COLMAP's units, with a normal for each depth.

@@ -2,10 +2,14 @@
 
 A network answers for one view at a time, and polishing moves one view at a time, so that what one gets
 wrong another often has right. Here the depths D_j of all views are held fixed as evidence. A pixel of view i,
-at its depth d, falls on a place of view j; with z its depth there, that view says that d should be multiplied
-by D_j / z. The weighted median of what the views say, its own depth among it, is found, then the weighted
-mean of what is near the median, and the pixel moves there. From the new place it asks again, for on a slanted
-surface the answer depends on where one looks.
+at its depth d, falls on a place of view j. With z its depth there, the surface is D_j − z further away from
+view j than the pixel is, and view j says that d should be d + D_j − z: exact for a surface that faces both.
+The weighted median of what the views say, its own depth among it, is found, then the weighted mean of what is
+near the median, and the pixel moves there. From the new place it asks again, for on a slanted surface the
+answer depends on where one looks.
+
+A view weighs by its confidence c_j, which stands for the inverse of the relative error of D_j; for the
+pixel's depth that is an error D_j / d times as large, so that the weight is c_j d / z: near views know better.
 
 What agrees afterwards is no evidence any more, for all views were asked: who wants to know what the views
 found independently of each other, as fusion does, takes the depths from before.
@@ -15,51 +19,83 @@ Medians of aligned depth maps: Merrell et al., Real-time visibility-based fusion
 
 from __future__ import annotations
 
+import logging
+import math
 from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from tco import _consensus_kernels
-from tco._consensus_kernels import ALL
 from tco.geometry import invert, pixel_grid, project, rays, sample, transform
 from tco.options import ConsensusConfig
+from tco.polish import displacement
 from tco.schedule import most_overlapping
-from tco.types import Cameras, Prediction, Views
+from tco.types import Cameras, Prediction, Priors, Views
+
+logger = logging.getLogger(__name__)
 
 JUMP = 1.1
 """Ratio of the depths in a square of nine pixels above which there is an edge among them, and what is
 interpolated there is on neither side of it."""
-BAND = 1 << 16
-"""Pixels of a view that are asked about together where memory grows with their number."""
+ALL = 1 - 1e-5
+"""Share of what is mixed at a place from which on all of it counts; less is at a border."""
+HALF = 0.5 * (1 - 1e-6)
+"""Share of the weights at which the median is: of an even number of equal ones the lower of the middle
+two, however they are rounded."""
+BAND = 1 << 15
+"""Pixels of a view that ask together; memory grows with them times the views that are asked."""
 
 
+@torch.no_grad()
 def agreed(
-    prediction: Prediction, cameras: Cameras, views: Views, overlap: Tensor, config: ConsensusConfig
+    prediction: Prediction, cameras: Cameras, views: Views, priors: Priors, config: ConsensusConfig
 ) -> Prediction:
     """The prediction with the depths of all wanted views moved to what the views say together.
 
     Args:
-        prediction: of all V views. Confidences weigh what a view says, and stay as they are.
+        prediction: of all V views. Confidences weigh what a view says, and stay as they are; a depth that is
+            not positive and finite is none, says nothing and stays.
         cameras: of all V views.
         views: whose valid pixels count, and which of them are wanted.
-        overlap: (V, V) how much views share; the ``consensus_views`` that share most are asked.
+        priors: whose ``overlap`` says which views share most points, and so are asked, and whose standard
+            deviations of the cameras say whether asking is of any use.
         config: settings.
+
+    Raises:
+        ValueError: the prediction is of some of the views alone, or there is no overlap among the priors.
     """
-    if config.consensus_rounds == 0 or len(views) < 2:
+    if len(prediction.depth) != len(views):
+        raise ValueError(f"all {len(views)} views must be predicted to agree, not {len(prediction.depth)}")
+    if priors.overlap is None:
+        raise ValueError("which views to ask is not known: there is no overlap among the priors")
+    if config.consensus_rounds == 0 or len(views) < 2 or _too_uncertain(priors, views, config):
         return prediction
-    evidence = torch.stack(
-        [1 / prediction.depth, prediction.confidence, (views.valid & smooth(prediction.depth)).float()], 1
-    ).detach()
-    moved = prediction.depth.detach().clone()
-    cpu = moved.device.type == "cpu"
+    known = torch.isfinite(prediction.depth) & (prediction.depth > 0)
+    depth = prediction.depth.where(known, torch.ones_like(prediction.depth))
+    counts = (views.valid & known & smooth(depth)).to(depth)
+    evidence = torch.stack([1 / depth, prediction.confidence, counts], 1)
+    moved = prediction.depth.clone()
     for view in views.wanted:
-        others = most_overlapping(overlap, view, config.consensus_views)
+        others = most_overlapping(priors.overlap, view, config.consensus_views)
         if others:
-            ask = _consensus_kernels.ask if cpu else ask_views
-            moved[view] = ask(evidence, cameras, view, others, config)
+            asked = _asked(evidence, cameras, view, others, config)
+            moved[view] = asked.where(known[view], moved[view])
     return replace(prediction, depth=moved, stages=())
+
+
+def _too_uncertain(priors: Priors, views: Views, config: ConsensusConfig) -> bool:
+    """Whether the cameras may be so wrong that what others see is elsewhere; that is told."""
+    if priors.cameras is None:
+        return False
+    moved = displacement(priors, views.size)
+    if moved > config.consensus_uncertainty:
+        logger.warning(
+            "the cameras are uncertain by %.1f pixels: views are not asked for each other's depths "
+            "(--consensus_uncertainty)",
+            moved * max(views.size),
+        )
+    return moved > config.consensus_uncertainty
 
 
 def smooth(depth: Tensor) -> Tensor:
@@ -69,13 +105,13 @@ def smooth(depth: Tensor) -> Tensor:
     return (high < JUMP * low).squeeze(1)
 
 
-def ask_views(
+def _asked(
     evidence: Tensor, cameras: Cameras, view: int, others: list[int], config: ConsensusConfig
 ) -> Tensor:
-    """Depth (H, W) of a view after all rounds, on any device; the plain twin of the compiled loop.
+    """Depth (H, W) of a view after all rounds.
 
     Args:
-        evidence: (V, 3, H, W) inverse depth, weight, and 1 where the two count.
+        evidence: (V, 3, H, W) inverse depth, confidence, and 1 where the two count.
         cameras: of all V views.
         view: whose pixels ask.
         others: views that are asked.
@@ -84,22 +120,40 @@ def ask_views(
     h, w = evidence.shape[-2:]
     ray = rays(pixel_grid(h, w, evidence).reshape(-1, 2), cameras.K[view])
     other_from_view = invert(cameras.world_from_cam[others]) @ cameras.world_from_cam[view]
-    inverse, weight = evidence[view, :2].reshape(2, -1)
-    found = []
+    inverse, confidence = evidence[view, :2].reshape(2, -1)
+    theirs, K, found = evidence[others], cameras.K[others], []
     for first in range(0, h * w, BAND):
         band = slice(first, first + BAND)
-        own, depth = 1 / inverse[band], 1 / inverse[band]
+        own = depth = 1 / inverse[band]
         for _ in range(config.consensus_rounds):
             points = transform(other_from_view, (ray[band] * depth[:, None]).unsqueeze(0))
-            xy, z = project(points, cameras.K[others])
-            there = sample(evidence[others], xy)
-            change = -torch.log((there[:, 0] * z).clamp_min(1e-9))
-            inside = (z > 1e-6) & (there[:, 2] > ALL) & (change.abs() < config.consensus_reach)
-            said = torch.cat([torch.log(own / depth)[None], change.where(inside, torch.zeros_like(change))])
-            weights = torch.cat([weight[None, band], there[:, 1] * inside])
+            xy, z = project(points, K)
+            said, weights = _words(sample(theirs, xy), z, depth, config.consensus_reach)
+            said = torch.cat([torch.log(own / depth)[None], said])
+            weights = torch.cat([confidence[None, band], weights])
             depth = depth * torch.exp(robust_mean(said, weights, config.consensus_width))
         found.append(depth)
     return torch.cat(found).reshape(h, w)
+
+
+def _words(there: Tensor, z: Tensor, depth: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+    """What S views say of N pixels: logarithms of factors of their depths (S, N); weights, 0 if not asked.
+
+    Args:
+        there: (S, 3, N) inverse depth, confidence and whether these count, where the pixels fall.
+        z: (S, N) depth of the pixels there.
+        depth: (N,) of the pixels in their own view.
+        reach: see :class:`tco.options.ConsensusConfig`.
+    """
+    front = z > 1e-6
+    z = z.where(front, torch.ones_like(z))
+    surface = 1 / there[:, 0].clamp_min(1e-9)
+    factor = 1 + (surface - z) / depth
+    low, high = math.exp(-reach), math.exp(reach)
+    near = (surface > low * z) & (surface < high * z) & (factor > low) & (factor < high)
+    asked = front & (there[:, 2] > ALL) & near
+    said = torch.log(factor.where(asked, torch.ones_like(factor)))
+    return said, there[:, 1] * (depth / z) * asked
 
 
 def robust_mean(values: Tensor, weights: Tensor, width: float) -> Tensor:
@@ -109,7 +163,7 @@ def robust_mean(values: Tensor, weights: Tensor, width: float) -> Tensor:
     """
     ordered, order = values.sort(0)
     sums = weights.gather(0, order).cumsum(0)
-    at = (sums < sums[-1:] / 2).sum(0, keepdim=True).clamp_max(len(values) - 1)
+    at = (sums < sums[-1:] * HALF).sum(0, keepdim=True).clamp_max(len(values) - 1)
     off = values - ordered.gather(0, at)
     near = weights / (1 + (off / width) ** 2)
     return (near * values).sum(0) / near.sum(0)

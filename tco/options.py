@@ -106,7 +106,7 @@ class ConsensusConfig:
     )
     consensus_views: int = knob(20, "views that a pixel asks, those that share the most points")
     consensus_reach: float = knob(
-        0.2,
+        0.15,
         "largest logarithm of the ratio of two depths that are taken for the same surface; lower it where "
         "thin things stand close before others",
     )
@@ -115,12 +115,19 @@ class ConsensusConfig:
         "logarithms this far from the median count half in the mean that is taken around it; the depths' "
         "noise, not their errors",
     )
+    consensus_uncertainty: float = knob(
+        0.0075,
+        "views are not asked where the standard deviations of the cameras move pixels by more than this "
+        "share of the longer side: what others see is then elsewhere",
+    )
 
     def __post_init__(self) -> None:
         if self.consensus_rounds < 0 or self.consensus_views < 1:
             raise ValueError("consensus_rounds must not be negative, and consensus_views at least 1")
         if not (self.consensus_reach > 0 and self.consensus_width > 0):
             raise ValueError("consensus_reach and consensus_width must be positive")
+        if self.consensus_uncertainty < 0:
+            raise ValueError("consensus_uncertainty must not be negative")
 
 
 @dataclass(frozen=True)

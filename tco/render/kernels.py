@@ -1,4 +1,4 @@
-"""The compiled loops of the CPU engines: sorted splats over the pixels of their boxes.
+"""The _compiled loops of the CPU engines: sorted splats over the pixels of their boxes.
 
 A splat is a row of 16 numbers, and so is its derivative: the ray transform (9), the centre (2), depth,
 opacity and the colours (3). Its box is x0, x1, y0, y1.
@@ -7,7 +7,7 @@ At pixel (x, y) the point of the tangent plane is found as in 2D Gaussian splatt
 X, Y, W of the ray transform, (x W − X) × (y W − Y) ∝ (a, b, 1). The product is affine in x and y:
 X × Y + x (Y × W) + y (W × X). Pixels are counted from the corner of the box, which keeps the digits.
 
-numba keeps compiled code by the date of the file of a loop, and does not see changes in what the loop
+numba keeps _compiled code by the date of the file of a loop, and does not see changes in what the loop
 imports: the helpers and constants of the loops belong into this file.
 """
 
@@ -35,12 +35,12 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 Array = np.ndarray[Any, Any]
 
 
-def compiled(function: _F) -> _F:
+def _compiled(function: _F) -> _F:
     """``function`` as machine code, kept on disk between runs where a folder for that can be written."""
     try:
         return numba.njit(nogil=True, cache=True, error_model="numpy")(function)
     except RuntimeError as error:
-        _log.debug("numba cannot keep compiled code on disk, it compiles in each process: %s", error)
+        _log.debug("numba cannot keep _compiled code on disk, it compiles in each process: %s", error)
         return numba.njit(nogil=True, error_model="numpy")(function)
 
 
@@ -102,7 +102,7 @@ def _carry(grad: Any, columns: Any, corner: Any, by_zeta: Any) -> None:
         grad[3 * k], grad[3 * k + 1], grad[3 * k + 2] = dX[k], dY[k], dW[k]
 
 
-@compiled
+@_compiled
 def composite(splats: Array, boxes: Array, image: Array) -> None:
     """Splats (N, 16), front first, into ``image`` (H, W, 5): colours, depth, transmittance from 1 down.
 
@@ -134,7 +134,7 @@ def composite(splats: Array, boxes: Array, image: Array) -> None:
                 pixel[4] = after
 
 
-@compiled
+@_compiled
 def composite_backward(splats: Array, boxes: Array, upstream: Array, rest: Array, grads: Array) -> None:
     """Derivatives of :func:`composite`, written to ``grads`` (N, 16), which starts at zero.
 
@@ -188,7 +188,7 @@ def composite_backward(splats: Array, boxes: Array, upstream: Array, rest: Array
         _carry(grad, _columns(row, box), (box[0], box[2]), (g0, gx, gy))
 
 
-@compiled
+@_compiled
 def nearest(splats: Array, boxes: Array, depth: Array) -> None:
     """Lower ``depth`` (H, W), infinite at first, to that of the nearest splat whose core holds the pixel."""
     for row, box in zip(splats, boxes):  # noqa: B905 (numba knows no strict)
@@ -202,7 +202,7 @@ def nearest(splats: Array, boxes: Array, depth: Array) -> None:
                         depth[box[2] + y, box[0] + x] = row[11]
 
 
-@compiled
+@_compiled
 def blend(splats: Array, boxes: Array, surface: Array, tolerance: float, image: Array) -> None:
     """Add splats (N, 16) of the nearest surface to ``image`` (H, W, 5): colours, depth and weight.
 
@@ -228,7 +228,7 @@ def blend(splats: Array, boxes: Array, surface: Array, tolerance: float, image: 
                     pixel[4] += weight
 
 
-@compiled
+@_compiled
 def blend_backward(
     splats: Array, boxes: Array, surface: Array, tolerance: float, upstream: Array, grads: Array
 ) -> None:

@@ -1,4 +1,4 @@
-"""What the views say together: medians, occlusions, edges, slanted surfaces, and the compiled loop."""
+"""What the views say together: medians, distances, occlusions, edges, slanted surfaces, missing depths."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from tco import _consensus_kernels
-from tco.consensus import agreed, ask_views, robust_mean, smooth
+from tco import consensus
+from tco.consensus import agreed, robust_mean, smooth
+from tco.geometry import invert, pixel_grid, project, rays, transform, unproject
 from tco.options import ConsensusConfig
 from tco.schedule import most_overlapping
 from tco.toy import Wall, wall
@@ -34,14 +35,9 @@ def scene_cameras(scene: Wall) -> Cameras:
     return scene.priors.cameras
 
 
-def overlap(scene: Wall) -> Tensor:
-    assert scene.priors.overlap is not None
-    return scene.priors.overlap
-
-
 def together(scene: Wall, prediction: Prediction, **changes: float) -> Tensor:
     config = ConsensusConfig(**changes)  # type: ignore[arg-type]
-    return agreed(prediction, scene_cameras(scene), scene.views, overlap(scene), config).depth
+    return agreed(prediction, scene_cameras(scene), scene.views, scene.priors, config).depth
 
 
 def off(depth: Tensor, truth: Tensor) -> Tensor:
@@ -68,8 +64,6 @@ def test_one_wrong_view_is_outvoted(scene: Wall) -> None:
 
 def by_enough(scene: Wall, view: int, fewest: int = 3) -> Tensor:
     """Pixels (H, W) of a view that at least so many others see."""
-    from tco.geometry import invert, project, transform, unproject
-
     cameras = scene_cameras(scene)
     h, w = scene.depth.shape[1:]
     points = transform(
@@ -129,6 +123,199 @@ def test_what_lies_between_two_surfaces_is_not_asked() -> None:
     assert bool(smooth(slope).all())
 
 
+def frontal(distances: list[float], height: float = 0.0) -> tuple[Wall, Tensor]:
+    """Cameras straight before the wall z = 0 at these distances; and the depths, which are the distances."""
+    scene = wall(len(distances), slope=0.0)
+    cameras = scene_cameras(scene)
+    pose = torch.eye(4).repeat(len(distances), 1, 1)
+    pose[:, 2, 3] = -torch.tensor(distances)
+    pose[:, 0, 3] = 0.1 * torch.arange(len(distances)) * min(distances)
+    overlap = 1 - torch.eye(len(distances))
+    priors = replace(scene.priors, cameras=Cameras(pose, cameras.K), overlap=overlap)
+    depth = torch.tensor(distances)[:, None, None].expand(-1, *scene.depth.shape[1:]).contiguous()
+    return replace(scene, priors=priors, depth=depth), depth
+
+
+@pytest.mark.parametrize("far", [0.4, 1.0, 1.5, 3.0])
+def test_views_at_other_distances_correct_by_lengths_not_by_shares(far: float) -> None:
+    """2 % at three times the distance are 6 % of the others' depths, and are gone after one round."""
+    scene, depth = frontal([far, *[1.0] * 6])
+    wrong = depth.clone()
+    wrong[0] *= 1.02
+    moved = together(scene, said(scene, wrong), consensus_rounds=1)
+    assert float(off(moved[0], depth[0])[by_enough(scene, 0)].median()) < 2e-3
+
+
+def test_near_views_weigh_more() -> None:
+    """One view at a third of the distance, of equal confidence, is as much as three at the same distance.
+
+    The asking view and two like it are wrong by as much as leaves the near one's word within reach.
+    """
+    for near, expected in ((0.2, 1.0), (0.5, 1.03)):
+        scene, depth = frontal([1.0, 1.0, 1.0, near])
+        wrong = depth.clone()
+        wrong[:3] *= 1.03
+        moved = together(scene, said(scene, wrong), consensus_width=1e-4, consensus_rounds=1)
+        seen = by_enough(scene, 0, 3)
+        assert float(moved[0][seen].median()) == pytest.approx(expected, abs=2e-3), near
+
+
+def test_a_second_round_asks_where_the_first_led() -> None:
+    """On a slanted wall the first answer is that for another place, and the second nearly right."""
+    scene = wall(VIEWS, slope=0.8)
+    wrong = scene.depth.clone()
+    wrong[0] *= 1.08
+    seen = by_enough(scene, 0)
+    first, second = (
+        float(off(together(scene, said(scene, wrong), consensus_rounds=n)[0], scene.depth[0])[seen].median())
+        for n in (1, 2)
+    )
+    assert second < 0.5 * first
+
+
+def test_the_own_word_stays_where_it_was(scene: Wall) -> None:
+    """The view's own depth is asked in every round as it was first said, not where the pixel has moved to.
+
+    Against six views that are 5 % off, a right one that weighs as much as they do ends halfway: with a wide
+    kernel the mean of all, in one round as in two.
+    """
+    wrong = 1.05 * scene.depth
+    wrong[3] = scene.depth[3]
+    prediction = said(scene, wrong, 1.0)
+    prediction.confidence[3] = 6.0
+    moved = together(scene, prediction, consensus_width=1e3)
+    seen = by_enough(scene, 3, VIEWS - 1)
+    assert float((moved[3] / scene.depth[3]).log()[seen].median()) == pytest.approx(0.0244, abs=2e-3)
+
+
+def test_reach_is_the_bound_it_says(scene: Wall) -> None:
+    others = 1.1 * scene.depth
+    others[0] = scene.depth[0]
+    near = together(scene, said(scene, others), consensus_reach=0.05)
+    assert torch.allclose(near[0], scene.depth[0], rtol=1e-6)
+    wide = together(scene, said(scene, others), consensus_reach=0.3)
+    assert float((wide[0] / scene.depth[0])[by_enough(scene, 0)].median()) > 1.08
+
+
+def test_as_many_views_are_asked_as_wanted(scene: Wall) -> None:
+    """View 3 shares most with view 2; asked alone, a word of more weight than the own one decides."""
+    assert scene.priors.overlap is not None
+    best = most_overlapping(scene.priors.overlap, 3, 1)[0]
+    wrong = 1.05 * scene.depth
+    wrong[best] = scene.depth[best]
+    prediction = said(scene, wrong, 5.0)
+    prediction.confidence[best] = 8.0
+    moved = together(scene, prediction, consensus_views=1, consensus_width=1e-4)
+    seen = by_enough(scene, 3, VIEWS - 1)
+    assert float(off(moved[3], scene.depth[3])[seen].median()) < 1e-3
+    everyone = together(scene, prediction, consensus_width=1e-4)
+    assert float(off(everyone[3], scene.depth[3])[seen].median()) > 0.04
+
+
+def test_the_order_of_the_views_is_no_matter(scene: Wall) -> None:
+    """All are asked as they were, none as it has become."""
+    generator = torch.Generator().manual_seed(5)
+    depth = scene.depth * (0.02 * torch.randn(scene.depth.shape, generator=generator)).exp()
+    moved = together(scene, said(scene, depth))
+    turned = list(range(VIEWS))[::-1]
+    cameras = scene_cameras(scene)[turned]
+    assert scene.priors.overlap is not None
+    overlap = scene.priors.overlap[turned][:, turned]
+    priors = replace(scene.priors, cameras=cameras, overlap=overlap)
+    views = replace(scene.views, valid=scene.views.valid[turned])
+    prediction = replace(said(scene, depth[turned]), cameras=cameras)
+    again = agreed(
+        prediction, cameras, views, replace(priors, sparse=None, centre_sigma=None), ConsensusConfig()
+    )
+    torch.testing.assert_close(again.depth.flip(0), moved, rtol=1e-5, atol=0)
+
+
+def test_edges_say_nothing(scene: Wall) -> None:
+    """The maps of views with a step in them are as if the pixels beside it were not valid."""
+    depth = scene.depth.clone()
+    depth[1:, :, 32:] *= 1.15
+    moved = together(scene, said(scene, depth))
+    views = replace(scene.views, valid=scene.views.valid & smooth(depth))
+    expected = agreed(said(scene, depth), scene_cameras(scene), views, scene.priors, ConsensusConfig())
+    assert torch.equal(moved, expected.depth)
+    assert not bool(smooth(depth)[1:].all())
+
+
+def test_focal_lengths_and_principal_points_are_those_of_each_view() -> None:
+    """Cameras whose pixels are not square and not centred, a different one each; the truth stays."""
+    scene = wall(5)
+    cameras = scene_cameras(scene)
+    K = cameras.K.clone()
+    for i in range(5):
+        K[i, 0, 0] *= 1 + 0.1 * i
+        K[i, 1, 1] *= 1.3 - 0.1 * i
+        K[i, :2, 2] += torch.tensor([3.0 - i, i - 2.0])
+    normal = torch.tensor([-0.3, 0.0, 1.0])
+    h, w = scene.depth.shape[1:]
+    ray = rays(pixel_grid(h, w, K).reshape(1, -1, 2), K) @ cameras.world_from_cam[:, :3, :3].transpose(1, 2)
+    depth = (2 - cameras.world_from_cam[:, :3, 3] @ normal).unsqueeze(-1) / (ray @ normal)
+    depth = depth.reshape(5, h, w)
+    priors = replace(scene.priors, cameras=Cameras(cameras.world_from_cam, K))
+    own = replace(scene, priors=priors, depth=depth)
+    wrong = depth.clone()
+    wrong[1] *= 1.04
+    moved = together(own, said(own, wrong))
+    assert float(off(moved[1], depth[1])[by_enough(own, 1)].median()) < 2e-3
+    others = [0, 2, 3, 4]
+    assert float(off(together(own, said(own, depth))[others], depth[others]).max()) < 1e-5
+
+
+def test_bands_make_no_difference(scene: Wall, monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(6)
+    depth = scene.depth * (0.02 * torch.randn(scene.depth.shape, generator=generator)).exp()
+    whole = together(scene, said(scene, depth))
+    monkeypatch.setattr(consensus, "BAND", 1000)
+    torch.testing.assert_close(together(scene, said(scene, depth)), whole, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("missing", [0.0, float("inf"), float("nan")])
+def test_depths_that_are_none_stay_none_and_say_nothing(scene: Wall, missing: float) -> None:
+    depth = scene.depth.clone()
+    depth[2, 10:20, 10:20] = missing
+    depth[0] *= 1.02
+    moved = together(scene, said(scene, depth))
+    torch.testing.assert_close(moved[2, 10:20, 10:20], depth[2, 10:20, 10:20], equal_nan=True)
+    there = torch.ones_like(depth, dtype=torch.bool)
+    there[2, 10:20, 10:20] = False
+    assert bool(torch.isfinite(moved[there]).all()) and bool((moved[there] > 0).all())
+    assert float(off(moved[0], scene.depth[0])[by_enough(scene, 0)].median()) < 1e-3
+
+
+def test_nothing_is_asked_where_cameras_are_uncertain(scene: Wall, caplog: pytest.LogCaptureFixture) -> None:
+    wrong = scene.depth.clone()
+    wrong[2] *= 1.08
+    assert scene.priors.rotation_sigma is not None
+    shaky = replace(scene.priors, rotation_sigma=10 * scene.priors.rotation_sigma)
+    prediction = said(scene, wrong)
+    same = agreed(prediction, scene_cameras(scene), scene.views, shaky, ConsensusConfig())
+    assert same is prediction and "--consensus_uncertainty" in caplog.text
+    wide = ConsensusConfig(consensus_uncertainty=1.0)
+    assert agreed(prediction, scene_cameras(scene), scene.views, shaky, wide) is not prediction
+
+
+def test_gradients_and_stages_end_here(scene: Wall) -> None:
+    prediction = said(scene, scene.depth.clone().requires_grad_())
+    prediction = replace(prediction, stages=(torch.zeros(VIEWS),))
+    moved = agreed(prediction, scene_cameras(scene), scene.views, scene.priors, ConsensusConfig())
+    assert not moved.depth.requires_grad and moved.stages == ()
+
+
+def test_some_of_the_views_cannot_agree(scene: Wall) -> None:
+    part = said(scene, scene.depth[:3])
+    with pytest.raises(ValueError, match="all 7 views"):
+        agreed(part, scene_cameras(scene), scene.views, scene.priors, ConsensusConfig())
+    with pytest.raises(ValueError, match="overlap"):
+        agreed(
+            said(scene, scene.depth), scene_cameras(scene), scene.views,
+            replace(scene.priors, overlap=None), ConsensusConfig(),
+        )  # fmt: skip
+
+
 def test_invalid_pixels_say_nothing(scene: Wall) -> None:
     """Views whose wrong depths are masked out do not pull."""
     wrong = scene.depth.clone()
@@ -136,7 +323,7 @@ def test_invalid_pixels_say_nothing(scene: Wall) -> None:
     views = replace(scene.views, valid=torch.ones_like(scene.views.valid))
     views.valid[1:] = False
     config = ConsensusConfig()
-    moved = agreed(said(scene, wrong), scene_cameras(scene), views, overlap(scene), config)
+    moved = agreed(said(scene, wrong), scene_cameras(scene), views, scene.priors, config)
     assert torch.allclose(moved.depth[0], scene.depth[0], rtol=1e-6)
 
 
@@ -144,7 +331,7 @@ def test_helpers_are_asked_and_do_not_move(scene: Wall) -> None:
     depth = scene.depth.clone()
     depth[0] *= 1.05
     views = replace(scene.views, helpers=3)
-    moved = agreed(said(scene, depth), scene_cameras(scene), views, overlap(scene), ConsensusConfig())
+    moved = agreed(said(scene, depth), scene_cameras(scene), views, scene.priors, ConsensusConfig())
     assert torch.equal(moved.depth[-3:], depth[-3:])
     assert float(off(moved.depth[0], scene.depth[0])[by_enough(scene, 0)].median()) < 2e-3
 
@@ -152,30 +339,11 @@ def test_helpers_are_asked_and_do_not_move(scene: Wall) -> None:
 def test_no_rounds_and_single_views_change_nothing(scene: Wall) -> None:
     prediction = said(scene, 1.02 * scene.depth)
     off_switch = ConsensusConfig(consensus_rounds=0)
-    assert agreed(prediction, scene_cameras(scene), scene.views, overlap(scene), off_switch) is prediction
-    alone = torch.zeros_like(overlap(scene))
+    assert agreed(prediction, scene_cameras(scene), scene.views, scene.priors, off_switch) is prediction
+    assert scene.priors.overlap is not None
+    alone = replace(scene.priors, overlap=torch.zeros_like(scene.priors.overlap))
     moved = agreed(prediction, scene_cameras(scene), scene.views, alone, ConsensusConfig())
     assert torch.equal(moved.depth, prediction.depth)
-
-
-@pytest.mark.parametrize("rounds", [1, 3])
-def test_the_compiled_loop_is_its_plain_twin(scene: Wall, rounds: int) -> None:
-    """Noise, an edge, masked pixels and a view that looks elsewhere; in double precision."""
-    generator = torch.Generator().manual_seed(rounds)
-    depth = (scene.depth * (1 + 0.03 * torch.randn(scene.depth.shape, generator=generator))).to(F64)
-    depth[:, :, 30:] *= 1.3
-    cameras = scene_cameras(scene).to(dtype=F64)
-    cameras.world_from_cam[5, :3, :3] @= torch.diag(torch.tensor([-1.0, 1, -1], dtype=F64))
-    confidence = 1 + torch.rand(depth.shape, generator=generator, dtype=F64)
-    counts = torch.rand(depth.shape, generator=generator) < 0.9
-    evidence = torch.stack([1 / depth, confidence, counts.to(F64)], 1)
-    config = ConsensusConfig(consensus_rounds=rounds)
-    for view in (0, 3, 5):
-        others = [other for other in range(VIEWS) if other != view]
-        plain = ask_views(evidence, cameras, view, others, config)
-        compiled = _consensus_kernels.ask(evidence, cameras, view, others, config)
-        torch.testing.assert_close(compiled, plain, rtol=1e-9, atol=0)
-        assert view == 5 or float(off(plain, depth[view]).max()) > 1e-3
 
 
 def test_robust_mean_by_hand() -> None:
@@ -193,6 +361,8 @@ def test_robust_mean_by_hand() -> None:
         torch.cat([values, values.new_full((1, 1), -9)]), torch.cat([even, even.new_zeros(1, 1)]), 0.1
     )
     assert float(more) == pytest.approx(expected)
+    # Of two alike the lower one is the median.
+    assert float(robust_mean(torch.tensor([[0.0], [1.0]]), torch.ones(2, 1), 0.01)) < 0.01
 
 
 def test_most_overlapping_views_first() -> None:
@@ -208,6 +378,7 @@ def test_most_overlapping_views_first() -> None:
         {"consensus_views": 0},
         {"consensus_reach": 0.0},
         {"consensus_width": 0.0},
+        {"consensus_uncertainty": -1.0},
     ],
 )
 def test_impossible_settings_are_refused(changes: dict[str, float]) -> None:

@@ -36,7 +36,7 @@ function curve(name, values, width) {
 
 export function startCurves(holder) {
   const chunks = data.loss.filter((columns) => Object.keys(columns).length);
-  if (!chunks.length) { holder.append(make('p', { class: 'soft' }, 'Nothing was optimised (--steps 0): the depths are those of the network as it is.')); return; }
+  if (!chunks.length) { holder.append(make('p', { class: 'soft' }, 'Nothing was optimised (--steps 0): the network was used as it is.')); return; }
   const grid = make('div', { class: 'grid' }), draw = (index) => {
     const columns = chunks[index], names = Object.keys(columns), first = ['loss', 'held_out'].filter((n) => names.includes(n));
     const steps = columns.loss?.length || 0, width = Math.max(3, Math.round(steps / 8));
