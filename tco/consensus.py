@@ -9,7 +9,8 @@ near the median, and the pixel moves there. From the new place it asks again, fo
 answer depends on where one looks.
 
 A view weighs by its confidence c_j, which stands for the inverse of the relative error of D_j; for the
-pixel's depth that is an error D_j / d times as large, so that the weight is c_j d / z: near views know better.
+pixel's depth that is an error D_j / d times as large, so that the weight is c_j d / z: near views know
+better.
 
 What agrees afterwards is no evidence any more, for all views were asked: who wants to know what the views
 found independently of each other, as fusion does, takes the depths from before.
