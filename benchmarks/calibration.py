@@ -1,9 +1,10 @@
 """Is the predicted error of a pixel its actual error? Table and plot on the real sets.
 
-    python -m benchmarks.calibration [--steps 0] [--output docs/calibration.md]
+    python -m benchmarks.calibration [--steps 5] [--output docs/calibration.md]
 
 The embedded network predicts the scale b of a Laplace distribution of each pixel's relative depth error, for
-which the mean of |error| is b; confidence is 1 + 0.02 / b. Pixels are put into classes of b, and the mean and
+which the mean of |error| is b; confidence is 1 + 0.02 / b. The depths are those that densify writes: optimised,
+and moved to what the views say together. Pixels are put into classes of b, and the mean and
 median of what a depth sensor says are set beside it. Errors above 50 % count as 50 %, as in training. The
 plot goes beside the Markdown file.
 """
@@ -19,8 +20,9 @@ from numpy.typing import NDArray
 from benchmarks.real import arguments, load, publish
 from tco.backbones.sweep import ERROR_UNIT
 from tco.backbones.weights import EMBEDDED, load_sweep
+from tco.consensus import agreed
 from tco.optimize import optimize
-from tco.options import TCOConfig
+from tco.options import ConsensusConfig, TCOConfig
 
 EDGES = np.array([0.0, 0.003, 0.005, 0.0075, 0.01, 0.015, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, 1.0])
 Row = tuple[float, float, float, float, float]
@@ -70,12 +72,13 @@ def plot(curves: dict[str, list[Row]], path: Path) -> None:
 def main() -> None:
     """Command line."""
     parser = arguments(__doc__ or "")
-    parser.set_defaults(steps=0, size=256, views=0)
+    parser.set_defaults(steps=TCOConfig().steps, size=256, views=0)
     args = parser.parse_args()
     network, curves = load_sweep(args.weights or EMBEDDED), {}
     for name in args.sets:
         real = load(name, args.size, args.views)
-        prediction = optimize(network, real.views, real.given, TCOConfig(steps=args.steps)).prediction
+        outcome = optimize(network, real.views, real.given, TCOConfig(steps=args.steps))
+        prediction = agreed(outcome.prediction, outcome.cameras, real.views, real.given, ConsensusConfig())
         known = real.truth > 0
         error = (prediction.depth / real.truth.clamp_min(1e-6) - 1).abs()[known].clamp_max(0.5)
         predicted = (ERROR_UNIT / (prediction.confidence[known] - 1).clamp_min(1e-3)).to(torch.float64)
