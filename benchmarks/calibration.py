@@ -3,10 +3,10 @@
     python -m benchmarks.calibration [--steps 5] [--output docs/calibration.md]
 
 The embedded network predicts the scale b of a Laplace distribution of each pixel's relative depth error, for
-which the mean of |error| is b; confidence is 1 + 0.02 / b. The depths are those that densify writes: optimised,
-and moved to what the views say together. Pixels are put into classes of b, and the mean and
-median of what a depth sensor says are set beside it. Errors above 50 % count as 50 %, as in training. The
-plot goes beside the Markdown file.
+which the mean of |error| is b; confidence is 1 + 0.02 / b. The depths are those that densify writes:
+optimised, and moved to what the views say together. Pixels are put into classes of b, and the mean and median
+of what a depth sensor says are set beside it. Errors above 50 % count as 50 %, as in training. The plot goes
+beside the Markdown file.
 """
 
 from __future__ import annotations
