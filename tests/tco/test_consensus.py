@@ -197,6 +197,17 @@ def test_reach_is_the_bound_it_says(scene: Wall) -> None:
     assert float((wide[0] / scene.depth[0])[by_enough(scene, 0)].median()) > 1.08
 
 
+def test_reach_counts_in_both_views() -> None:
+    """30 % behind what a near view should see is another surface, if only 10 % of the far view's depth."""
+    scene, depth = frontal([3.0, 1.0, 1.0, 1.0])
+    for factor, stays in ((1.1, False), (1.3, True), (1 / 1.3, True)):
+        wrong = depth.clone()
+        wrong[1:] *= factor
+        moved = together(scene, said(scene, wrong), consensus_rounds=1)
+        seen = by_enough(scene, 0)
+        assert torch.allclose(moved[0][seen], depth[0][seen], rtol=1e-4) == stays, factor
+
+
 def test_as_many_views_are_asked_as_wanted(scene: Wall) -> None:
     """View 3 shares most with view 2; asked alone, a word of more weight than the own one decides."""
     assert scene.priors.overlap is not None
