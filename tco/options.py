@@ -116,7 +116,7 @@ class ConsensusConfig:
         "noise, not their errors",
     )
     consensus_uncertainty: float = knob(
-        0.01,
+        0.006,
         "views are not asked where the standard deviations of the cameras move pixels by more than this "
         "share of the longer side: what others see is then elsewhere",
     )
