@@ -66,7 +66,6 @@ def main() -> None:
     )
     for steps in (0, args.steps):
         outcomes = [optimize(network, real.views, real.given, TCOConfig(steps=steps)) for real in sets]
-        cell(sets[0], outcomes[0], ConsensusConfig())  # compiles the loop
         text += f"\n## {steps} steps\n\n{head}"
         for name, config in variants():
             cells = [cell(real, outcome, config) for real, outcome in zip(sets, outcomes, strict=True)]

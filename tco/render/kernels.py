@@ -1,4 +1,4 @@
-"""The _compiled loops of the CPU engines: sorted splats over the pixels of their boxes.
+"""The compiled loops of the CPU engines: sorted splats over the pixels of their boxes.
 
 A splat is a row of 16 numbers, and so is its derivative: the ray transform (9), the centre (2), depth,
 opacity and the colours (3). Its box is x0, x1, y0, y1.
@@ -7,7 +7,7 @@ At pixel (x, y) the point of the tangent plane is found as in 2D Gaussian splatt
 X, Y, W of the ray transform, (x W − X) × (y W − Y) ∝ (a, b, 1). The product is affine in x and y:
 X × Y + x (Y × W) + y (W × X). Pixels are counted from the corner of the box, which keeps the digits.
 
-numba keeps _compiled code by the date of the file of a loop, and does not see changes in what the loop
+numba keeps compiled code by the date of the file of a loop, and does not see changes in what the loop
 imports: the helpers and constants of the loops belong into this file.
 """
 
@@ -40,7 +40,7 @@ def _compiled(function: _F) -> _F:
     try:
         return numba.njit(nogil=True, cache=True, error_model="numpy")(function)
     except RuntimeError as error:
-        _log.debug("numba cannot keep _compiled code on disk, it compiles in each process: %s", error)
+        _log.debug("numba cannot keep compiled code on disk, it compiles in each process: %s", error)
         return numba.njit(nogil=True, error_model="numpy")(function)
 
 
