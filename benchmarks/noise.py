@@ -4,13 +4,14 @@
 
 Every camera is turned about a random axis by a normal angle, its centre moved in a random direction (relative
 to the mean distance of the centres from their middle), its focal length multiplied. Depths at triangulated
-points are left as they are: this is a table about cameras. Four ways to use such cameras are compared:
+points are left as they are: this is a table about cameras. Ways to use such cameras are compared:
 
 network     the network alone, which takes them as they are
 held        the optimisation with the cameras as they are
 plain       cameras may move and are held by the paper's penalties with its weights
 weighted    cameras may move and are held by their standard deviations, with a robust kernel; the network is
             given the corrected ones
+agreed      weighted, and the views asked together what the depths are
 """
 
 from __future__ import annotations
@@ -73,8 +74,8 @@ def main() -> None:
     head = [f"{name} {way}" for name in args.sets for way in (*configs, "agreed")]
     lines = [
         "# Noise in the camera priors\n",
-        f"`python -m benchmarks.noise`: {args.views or 'all'} views of {args.size} pixels, {args.steps} "
-        "steps. Share of measured pixels within 5 %; in brackets the mean error of relative rotations in "
+        f"`python -m benchmarks.noise --steps {args.steps}`: {args.views or 'all'} views of {args.size} "
+        f"pixels, {args.steps} steps. Share of measured pixels within 5 %; in brackets the mean error of relative rotations in "
         "degrees.\n",
         "| noise | " + " | ".join(head) + " |",
         "|---" * (len(head) + 1) + "|",

@@ -20,7 +20,6 @@ Medians of aligned depth maps: Merrell et al., Real-time visibility-based fusion
 
 from __future__ import annotations
 
-import logging
 import math
 from dataclasses import replace
 
@@ -30,11 +29,9 @@ from torch import Tensor
 
 from tco.geometry import invert, pixel_grid, project, rays, sample, transform
 from tco.options import ConsensusConfig
-from tco.polish import displacement
+from tco.polish import too_uncertain
 from tco.schedule import most_overlapping
 from tco.types import Cameras, Prediction, Priors, Views
-
-logger = logging.getLogger(__name__)
 
 JUMP = 1.1
 """Ratio of the depths in a square of nine pixels above which there is an edge among them, and what is
@@ -70,7 +67,12 @@ def agreed(
         raise ValueError(f"all {len(views)} views must be predicted to agree, not {len(prediction.depth)}")
     if priors.overlap is None:
         raise ValueError("which views to ask is not known: there is no overlap among the priors")
-    if config.consensus_rounds == 0 or len(views) < 2 or _too_uncertain(priors, views, config):
+    if config.consensus_rounds == 0 or len(views) < 2:
+        return prediction
+    consequence = "views are not asked for each other's depths (--consensus_uncertainty)"
+    if priors.cameras is not None and too_uncertain(
+        priors, views.size, config.consensus_uncertainty, consequence
+    ):
         return prediction
     known = torch.isfinite(prediction.depth) & (prediction.depth > 0)
     depth = prediction.depth.where(known, torch.ones_like(prediction.depth))
@@ -83,20 +85,6 @@ def agreed(
             asked = _asked(evidence, cameras, view, others, config)
             moved[view] = asked.where(known[view], moved[view])
     return replace(prediction, depth=moved, stages=())
-
-
-def _too_uncertain(priors: Priors, views: Views, config: ConsensusConfig) -> bool:
-    """Whether the cameras may be so wrong that what others see is elsewhere; that is told."""
-    if priors.cameras is None:
-        return False
-    moved = displacement(priors, views.size)
-    if moved > config.consensus_uncertainty:
-        logger.warning(
-            "the cameras are uncertain by %.1f pixels: views are not asked for each other's depths "
-            "(--consensus_uncertainty)",
-            moved * max(views.size),
-        )
-    return moved > config.consensus_uncertainty
 
 
 def smooth(depth: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ from tco.free import FreePixels
 from tco.lora import LoRAConfig, adapted
 from tco.options import TCOConfig
 from tco.penalties import sparse_depth
-from tco.polish import displacement, polish
+from tco.polish import polish, too_uncertain
 from tco.schedule import Sources, Stagnation, draw_targets
 from tco.terms import COMPATIBILITY, ExtraTerm, Terms, errors_at, means
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
@@ -342,13 +342,8 @@ class _Run:
         c = self.config.polish
         if c.polish_looks == 0 or self.priors.cameras is None:
             return outcome
-        size = outcome.prediction.depth.shape[-2:]
-        moved = displacement(self.priors, (size[0], size[1]))
-        if moved > c.polish_uncertainty:
-            logger.warning(
-                "the cameras are uncertain by %.1f pixels: depths are not refined (--polish_uncertainty)",
-                moved * max(size),
-            )
+        consequence = "depths are not refined (--polish_uncertainty)"
+        if too_uncertain(self.priors, self.views.size, c.polish_uncertainty, consequence):
             return outcome
         done = polish(
             outcome.prediction, outcome.cameras, self.terms, self.config, self.generator, report, self.watched

@@ -215,6 +215,21 @@ def displacement(priors: Priors, size: tuple[int, int]) -> float:
     return float(moved.sqrt().median()) / max(size)
 
 
+def too_uncertain(priors: Priors, size: tuple[int, int], bound: float, consequence: str) -> bool:
+    """Whether :func:`displacement` exceeds a bound; what follows from that is told.
+
+    Args:
+        priors: of V views, with cameras.
+        size: height and width of the views, pixels.
+        bound: in parts of the longer side.
+        consequence: the end of the warning.
+    """
+    moved = displacement(priors, size)
+    if moved > bound:
+        logger.warning("the cameras are uncertain by %.1f pixels: %s", moved * max(size), consequence)
+    return moved > bound
+
+
 def _weights(terms: Terms, config: TCOConfig) -> dict[str, float]:
     """The adaptation's weights, with colours warped, and with what polishing weighs in its own way."""
     c = config.polish

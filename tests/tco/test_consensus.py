@@ -123,8 +123,8 @@ def test_what_lies_between_two_surfaces_is_not_asked() -> None:
     assert bool(smooth(slope).all())
 
 
-def frontal(distances: list[float], height: float = 0.0) -> tuple[Wall, Tensor]:
-    """Cameras straight before the wall z = 0 at these distances; and the depths, which are the distances."""
+def frontal(distances: list[float]) -> Wall:
+    """Cameras straight before the wall z = 0 at these distances, which are the depths."""
     scene = wall(len(distances), slope=0.0)
     cameras = scene_cameras(scene)
     pose = torch.eye(4).repeat(len(distances), 1, 1)
@@ -133,27 +133,24 @@ def frontal(distances: list[float], height: float = 0.0) -> tuple[Wall, Tensor]:
     overlap = 1 - torch.eye(len(distances))
     priors = replace(scene.priors, cameras=Cameras(pose, cameras.K), overlap=overlap)
     depth = torch.tensor(distances)[:, None, None].expand(-1, *scene.depth.shape[1:]).contiguous()
-    return replace(scene, priors=priors, depth=depth), depth
+    return replace(scene, priors=priors, depth=depth)
 
 
 @pytest.mark.parametrize("far", [0.4, 1.0, 1.5, 3.0])
 def test_views_at_other_distances_correct_by_lengths_not_by_shares(far: float) -> None:
     """2 % at three times the distance are 6 % of the others' depths, and are gone after one round."""
-    scene, depth = frontal([far, *[1.0] * 6])
-    wrong = depth.clone()
+    scene = frontal([far, *[1.0] * 6])
+    wrong = scene.depth.clone()
     wrong[0] *= 1.02
     moved = together(scene, said(scene, wrong), consensus_rounds=1)
-    assert float(off(moved[0], depth[0])[by_enough(scene, 0)].median()) < 2e-3
+    assert float(off(moved[0], scene.depth[0])[by_enough(scene, 0)].median()) < 2e-3
 
 
 def test_near_views_weigh_more() -> None:
-    """One view at a third of the distance, of equal confidence, is as much as three at the same distance.
-
-    The asking view and two like it are wrong by as much as leaves the near one's word within reach.
-    """
+    """One view at a fifth of the distance outvotes three that are wrong alike; one at half does not."""
     for near, expected in ((0.2, 1.0), (0.5, 1.03)):
-        scene, depth = frontal([1.0, 1.0, 1.0, near])
-        wrong = depth.clone()
+        scene = frontal([1.0, 1.0, 1.0, near])
+        wrong = scene.depth.clone()
         wrong[:3] *= 1.03
         moved = together(scene, said(scene, wrong), consensus_width=1e-4, consensus_rounds=1)
         seen = by_enough(scene, 0, 3)
@@ -199,13 +196,13 @@ def test_reach_is_the_bound_it_says(scene: Wall) -> None:
 
 def test_reach_counts_in_both_views() -> None:
     """30 % behind what a near view should see is another surface, if only 10 % of the far view's depth."""
-    scene, depth = frontal([3.0, 1.0, 1.0, 1.0])
+    scene = frontal([3.0, 1.0, 1.0, 1.0])
     for factor, stays in ((1.1, False), (1.3, True), (1 / 1.3, True)):
-        wrong = depth.clone()
+        wrong = scene.depth.clone()
         wrong[1:] *= factor
         moved = together(scene, said(scene, wrong), consensus_rounds=1)
         seen = by_enough(scene, 0)
-        assert torch.allclose(moved[0][seen], depth[0][seen], rtol=1e-4) == stays, factor
+        assert torch.allclose(moved[0][seen], scene.depth[0][seen], rtol=1e-4) == stays, factor
 
 
 def test_as_many_views_are_asked_as_wanted(scene: Wall) -> None:
