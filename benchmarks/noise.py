@@ -75,8 +75,8 @@ def main() -> None:
     lines = [
         "# Noise in the camera priors\n",
         f"`python -m benchmarks.noise --steps {args.steps}`: {args.views or 'all'} views of {args.size} "
-        f"pixels, {args.steps} steps. Share of measured pixels within 5 %; in brackets the mean error of relative rotations in "
-        "degrees.\n",
+        f"pixels, {args.steps} steps. Share of measured pixels within 5 %; in brackets the mean error of "
+        "relative rotations in degrees.\n",
         "| noise | " + " | ".join(head) + " |",
         "|---" * (len(head) + 1) + "|",
     ]
