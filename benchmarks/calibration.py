@@ -78,7 +78,8 @@ def main() -> None:
     for name in args.sets:
         real = load(name, args.size, args.views)
         outcome = optimize(network, real.views, real.given, TCOConfig(steps=args.steps))
-        prediction = agreed(outcome.prediction, outcome.cameras, real.views, real.given, ConsensusConfig())
+        asking = ConsensusConfig()
+        prediction = agreed(outcome.prediction, outcome.cameras, real.views, real.given, asking).prediction
         known = real.truth > 0
         error = (prediction.depth / real.truth.clamp_min(1e-6) - 1).abs()[known].clamp_max(0.5)
         predicted = (ERROR_UNIT / (prediction.confidence[known] - 1).clamp_min(1e-3)).to(torch.float64)

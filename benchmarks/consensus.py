@@ -43,8 +43,9 @@ def cell(real: RealSet, outcome: Outcome, config: ConsensusConfig) -> str:
     start = time.process_time()
     together = agreed(outcome.prediction, outcome.cameras, real.views, real.given, config)
     seconds = time.process_time() - start
-    near, close = within(together, real.truth, 0.02), within(together, real.truth)
-    return f"{near:.3f} {close:.3f} {100 * median_error(together, real.truth):.2f} % {seconds:.1f} s"
+    depths = together.prediction
+    near, close = within(depths, real.truth, 0.02), within(depths, real.truth)
+    return f"{near:.3f} {close:.3f} {100 * median_error(depths, real.truth):.2f} % {seconds:.1f} s"
 
 
 def main() -> None:

@@ -92,7 +92,7 @@ def main() -> None:
                 )
             asking = ConsensusConfig(consensus_uncertainty=args.consensus_uncertainty)
             together = agreed(outcome.prediction, outcome.cameras, real.views, noisy, asking)
-            cells.append(f"{within(together, real.truth):.3f}")
+            cells.append(f"{within(together.prediction, real.truth):.3f}")
         lines.append(f"| {TABLE[row]} | " + " | ".join(cells) + " |")
         if args.output is None:
             publish(lines[-1] + "\n", None)

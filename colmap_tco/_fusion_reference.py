@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from colmap_tco import _fusion_kernels, _merge_kernels, _vote_kernels
 from colmap_tco._fusion_shelf import Shelf, ShelfView
@@ -28,6 +29,9 @@ _COLOR_SAMPLES = 15
 """Views that a colour is the median of, at most."""
 _FEWEST_VIEWS = 3
 """Where fewer views than ``min_num_pixels`` can see a point, all of them but at least these must agree."""
+
+_GAP = 1.2
+"""Distance, in pixels, from which on there is a gap between two points: pixels side by side are 1 apart."""
 
 Group = list[tuple[int, ShelfView]]
 """Neighbours that are in memory together, with their slots."""
@@ -87,7 +91,10 @@ class Reference:
         position: int,
         config: FusionConfig,
         tolerance: Tolerance,
+        covered: cKDTree | None = None,
     ) -> None:
+        """The view at this position; points near those that are ``covered``, if given, are left out."""
+        self._covered = covered
         self._shelf, self._views, self._position = shelf, views, position
         self._config, self._tolerance = config, tolerance
         # A set in ascending order: the result does not depend on the order within the list.
@@ -110,6 +117,8 @@ class Reference:
         )
         if self._config.roi:
             cloud = self._crop(cloud, report)
+        if self._covered is not None:
+            cloud = self._in_gaps(cloud, self._covered, report)
         report.points[self._views[self._position].name] = len(cloud)
         report.pixels["points"] += len(cloud)
         return cloud
@@ -120,6 +129,16 @@ class Reference:
         inside = np.flatnonzero(((cloud.points >= low) & (cloud.points <= high)).all(1))
         report.pixels["roi"] += len(cloud) - len(inside)
         return cloud.select(inside)
+
+    def _in_gaps(self, cloud: Cloud, covered: cKDTree, report: FusionReport) -> Cloud:
+        """The points with no other within ``_GAP`` pixels of this view at their depth."""
+        pose, focal = self._views[self._position].cam_from_world, self._own.camera[0]
+        depth = (cloud.points - centre(self._views[self._position])) @ pose[2, :3]
+        near, workers = _GAP * depth / focal, max(self._config.num_threads, 0) or -1
+        away, _ = covered.query(cloud.points, distance_upper_bound=near.max(initial=0), workers=workers)
+        alone = np.flatnonzero(away > near)
+        report.pixels["no_gap"] += len(cloud) - len(alone)
+        return cloud.select(alone)
 
     def _fuse(self, pixels: NDArray[np.int64], report: FusionReport) -> list[Cloud]:
         """The points of these pixels (M,), flat indices into the reference, range by range."""

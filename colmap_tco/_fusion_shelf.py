@@ -20,6 +20,7 @@ _MARKS = {
     "no_depth": kernels.NO_DEPTH,
     "mask": kernels.MASKED,
     "min_confidence": kernels.LOW_CONFIDENCE,
+    "max_agreed_error": kernels.INEXACT,
     "no_normal": kernels.NO_NORMAL,
     "max_view_angle": kernels.GRAZING,
     "max_depth_bend": kernels.EDGE,
@@ -176,13 +177,15 @@ def _arrays(maps: FusionMaps) -> kernels.Maps:
         np.ascontiguousarray(maps.normal, np.float32),
         np.ascontiguousarray(confidence, np.float32),
         np.zeros((0, 0), bool) if maps.mask is None else np.ascontiguousarray(maps.mask, bool),
+        np.zeros((0, 0), np.float32) if maps.error is None else np.ascontiguousarray(maps.error, np.float32),
     )
 
 
-def _bounds(config: FusionConfig, view: FusionView) -> tuple[float, float, float, float]:
+def _bounds(config: FusionConfig, view: FusionView) -> tuple[float, float, float, float, float]:
     bend = config.max_depth_bend if config.max_depth_bend > 0 else math.inf
     far = config.max_depth_ratio * view.reach if config.max_depth_ratio > 0 else math.inf
-    return config.min_confidence, bend, math.cos(math.radians(config.max_view_angle)), far
+    cosine = math.cos(math.radians(config.max_view_angle))
+    return config.min_confidence, bend, cosine, far, config.max_agreed_error
 
 
 def _check_maps(view: FusionView, maps: FusionMaps, config: FusionConfig) -> None:
@@ -191,7 +194,7 @@ def _check_maps(view: FusionView, maps: FusionMaps, config: FusionConfig) -> Non
         raise ValueError(f"{view.name}: min_confidence and sigma_at_one need a confidence, it has none")
     if maps.normal.shape != (*shape, 3):
         raise ValueError(f"{view.name}: normals {maps.normal.shape} do not fit the depths {shape}")
-    for name, array in (("confidence", maps.confidence), ("mask", maps.mask)):
+    for name, array in (("confidence", maps.confidence), ("mask", maps.mask), ("error", maps.error)):
         if array is not None and array.shape != shape:
             raise ValueError(f"{view.name}: {name} {array.shape} does not fit the depths {shape}")
     if maps.image.dtype != np.uint8 or maps.image.ndim != 3 or maps.image.shape[2] != 3:

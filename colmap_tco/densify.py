@@ -311,7 +311,8 @@ def _fuse_and_write(
 ) -> dict[str, Any]:  # fmt: skip
     """Model, lists and cloud; returns their figures for the report."""
     pairs, tracks = seen
-    progress.stage("fusion", len(used))
+    filling = config.fusion.max_agreed_error > 0
+    progress.stage("fusion", len(used) * (2 if filling else 1))
     names = [view.name for view in views]
     sources = source_views(pairs, config.fusion.check_num_images)
     neighbours = {names[i]: [names[j] for j in sources[i]] for i in range(len(names))}
@@ -322,8 +323,11 @@ def _fuse_and_write(
     why = None
     try:
         reach = outputs.reaches(tracks, used)
-        shelf = outputs.fusion_views(result.paths, used, neighbours, indices, reach)
-        cloud, fused = fuse(shelf, config.fusion, progress.advance)
+        own, agreed = (
+            outputs.fusion_views(result.paths, used, neighbours, indices, reach, agreed)
+            for agreed in (False, True)
+        )
+        cloud, fused = fuse(own, config.fusion, progress.advance, agreed)
     except EmptyCloudError as error:  # the depth maps are there all the same
         cloud, fused, why = error.cloud, error.report, str(error)
     outputs.write_cloud(result.paths, cloud)

@@ -133,14 +133,19 @@ def fill(existing: Existing, view: View, maps: ViewMaps) -> tuple[ViewMaps, dict
     confidence[ours.found] = maps.confidence[ours.row[ours.found], ours.col[ours.found]]
     take, mask = kept.found, map_mask(view, shape)
     confidence[take] = existing.confidence
+    error = np.zeros(shape, np.float32)
+    if maps.error is not None:
+        error[ours.found] = maps.error[ours.row[ours.found], ours.col[ours.found]]
+    error[take] = 0
     merged = ViewMaps(
         np.where(take, kept.depth, ours.depth),
         np.where(take[..., None], kept.normal, ours.normal),
         confidence,
+        None if maps.error is None else error,
     )
     if mask is not None:
         take &= mask
-        merged.depth[~mask], merged.normal[~mask], merged.confidence[~mask] = 0, 0, 1
+        merged.depth[~mask], merged.normal[~mask], merged.confidence[~mask], error[~mask] = 0, 0, 1, 0
     return merged, _counts(int(take.sum()), merged.depth)
 
 

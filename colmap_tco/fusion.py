@@ -7,6 +7,10 @@ the two normals agree (``max_normal_error``). The point is the confidence-weight
 surfaces, its colour the median of their images, and the pixels of the other views
 that it was made of are not used as references again.
 
+Where that leaves gaps, the depths that the views agreed on when they were asked for each other's
+(:mod:`tco.consensus`) go the same way, of those pixels of which the views were hardly apart, and what lies in
+a gap is added.
+
 Views are loaded when they are needed and kept while they fit ``cache_size``, so that memory does not
 grow with the number of views. The result does not depend on the number of threads.
 """
@@ -15,6 +19,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,6 +30,9 @@ from colmap_tco.fusion_report import FusionReport, why_empty
 from colmap_tco.ply import Cloud, join
 from colmap_tco.thin import thin
 from colmap_tco.workers import Workers
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 __all__ = ["EmptyCloudError", "FusionConfig", "FusionMaps", "FusionView", "fuse", "fuse_views"]
 
@@ -45,19 +53,34 @@ class EmptyCloudError(DensifyError):
 
 
 def fuse(
-    views: Sequence[FusionView], config: FusionConfig | None = None, fused: Callable[[], None] = lambda: None
+    views: Sequence[FusionView],
+    config: FusionConfig | None = None,
+    fused: Callable[[], None] = lambda: None,
+    agreed: Sequence[FusionView] = (),
 ) -> tuple[Cloud, FusionReport]:
-    """Fuse all views into one cloud; see :func:`fuse_views`. ``fused`` is called after each view.
+    """Fuse all views into one cloud; see :func:`fuse_views`.
+
+    Args:
+        views: with what each found by itself.
+        config: bounds and filters.
+        fused: called after each view, of ``views`` and of ``agreed``.
+        agreed: the same views with what they agreed on and its standard error, to fill gaps.
 
     Raises:
         EmptyCloudError: no point is left; the message names the filter that removed most.
     """
+    from scipy.spatial import cKDTree
+
     config = config or FusionConfig()
     report = FusionReport()
-    parts = []
-    for part in fuse_views(views, config, report):
-        parts.append(part)
-        fused()
+    parts = _all(fuse_views(views, config, report), fused)
+    if agreed and config.max_agreed_error > 0 and report.pixels["points"]:
+        covered = cKDTree(np.concatenate([part.points for part in parts]))
+        gaps = FusionReport()
+        more = _all(fuse_views(agreed, config, gaps, covered), fused)
+        report.fill(gaps)
+        # View by view, as the report counts them.
+        parts = [part for of_view in zip(parts, more, strict=True) for part in of_view]
     cloud = join(parts)
     kept = thin(cloud.points, config.voxel_size, config.max_points)
     if len(kept) < len(cloud):
@@ -71,13 +94,24 @@ def fuse(
     return cloud, report
 
 
-def fuse_views(views: Sequence[FusionView], config: FusionConfig, report: FusionReport) -> Iterator[Cloud]:
+def _all(clouds: Iterator[Cloud], fused: Callable[[], None]) -> list[Cloud]:
+    parts = []
+    for part in clouds:
+        parts.append(part)
+        fused()
+    return parts
+
+
+def fuse_views(
+    views: Sequence[FusionView], config: FusionConfig, report: FusionReport, covered: cKDTree | None = None
+) -> Iterator[Cloud]:
     """Fuse view after view: one cloud for each of ``views`` in turn, in the world frame.
 
     Args:
         views: all views; their neighbours are positions in this list.
         config: bounds and filters.
         report: is filled while the clouds are taken.
+        covered: points next to which there is no gap to fill; None: every point is wanted.
 
     Raises:
         ValueError: settings or neighbours out of range, or arrays of a view that do not fit together.
@@ -92,7 +126,7 @@ def fuse_views(views: Sequence[FusionView], config: FusionConfig, report: Fusion
         tolerance = report.tolerance = _fusion_noise.tolerance(shelf, views, config)
         log.debug("fusion tolerates %s", tolerance)
         for position in range(len(views)):
-            cloud = Reference(shelf, views, position, config, tolerance).fuse(report)
+            cloud = Reference(shelf, views, position, config, tolerance, covered).fuse(report)
             report.loads, report.peak_bytes = shelf.loads, shelf.peak_bytes
             shelf.finish(position)
             yield cloud
@@ -102,7 +136,7 @@ def _check(views: Sequence[FusionView], config: FusionConfig) -> None:
     for name in ("min_num_pixels", "check_num_images", "max_reproj_error", "max_depth_error", "cache_size"):
         if not getattr(config, name) > 0:
             raise ValueError(f"{name} must be positive, not {getattr(config, name)}")
-    for name in ("voxel_size", "max_points", "max_depth_ratio", "min_tri_angle"):
+    for name in ("voxel_size", "max_points", "max_depth_ratio", "min_tri_angle", "max_agreed_error"):
         if not getattr(config, name) >= 0:
             raise ValueError(f"{name} must not be negative, it is {getattr(config, name)}")
     if config.roi and not (len(config.roi) == 6 and np.all(np.less(config.roi[:3], config.roi[3:]))):

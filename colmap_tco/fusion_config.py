@@ -76,6 +76,11 @@ class FusionConfig:
         "Keep only points within xmin,ymin,zmin,xmax,ymax,zmax, in the coordinates of the model; the others "
         "are cut off, those that stay do not change. Empty: all points.",
     )
+    max_agreed_error: float = knob(
+        0.002,
+        "Where the cloud has gaps, depths that the views agreed on are taken if their relative standard "
+        "error, by how far apart the views were, is at most this. 0: the gaps stay.",
+    )
     voxel_size: float = knob(
         0.0,
         "Thin the cloud to one point in each cube of this side, in units of the model: the one nearest to "

@@ -24,6 +24,7 @@ class FusionMaps:
         image: (H', W', 3) uint8 RGB, undistorted, of any size with the camera's field of view.
         confidence: (H, W) at least 1, or None if there is none.
         mask: (H, W) bool, False where pixels shall take no part, or None.
+        error: (H, W) relative standard error of the depth, 0 where it is not known, or None: all take part.
     """
 
     depth: NDArray[np.float32]
@@ -31,6 +32,7 @@ class FusionMaps:
     image: NDArray[np.uint8]
     confidence: NDArray[np.float32] | None = None
     mask: NDArray[np.bool_] | None = None
+    error: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)

@@ -43,11 +43,14 @@ class ViewMaps:
         depth: (H, W) camera z in the units of the model, 0 where there is none.
         normal: (H, W, 3) unit normals in the camera frame, facing the camera, 0 where there is none.
         confidence: (H, W) at least 1.
+        error: (H, W) relative standard error of the depth by how far apart the views were that were asked, 0
+            where too few were; None if none were.
     """
 
     depth: NDArray[np.float32]
     normal: NDArray[np.float32]
     confidence: NDArray[np.float32]
+    error: NDArray[np.float32] | None = None
 
 
 def write_view(paths: DensePaths, view: View, maps: ViewMaps) -> None:
@@ -78,6 +81,7 @@ def write_maps(paths: DensePaths, name: str, maps: ViewMaps, own: ViewMaps | Non
     write_map(paths.depth_map(name), maps.depth)
     write_map(paths.normal_map(name), maps.normal)
     write_map(paths.confidence_map(name), maps.confidence)
+    write_map(paths.error_map(name), np.zeros_like(maps.depth) if maps.error is None else maps.error)
     own = own or maps
     for path, array in zip(paths.own_maps(name), (own.depth, own.normal), strict=True):
         write_map(path, array)
@@ -188,6 +192,7 @@ def fusion_views(
     neighbours: Mapping[str, Sequence[str]],
     indices: Mapping[str, int],
     reach: Mapping[str, float] | None = None,
+    agreed: bool = False,
 ) -> list[FusionView]:
     """The views of a dense workspace for :func:`colmap_tco.fusion.fuse`; arrays are read when needed.
 
@@ -197,6 +202,7 @@ def fusion_views(
         neighbours: name → names of overlapping views, the best first; others than ``views`` are ignored.
         indices: as :func:`write_model` returns them.
         reach: name → depth that hardly a point exceeds, see :func:`reaches`; no bound for other views.
+        agreed: with the maps that the views agreed on instead of each view's own.
     """
     position = {view.name: i for i, view in enumerate(views)}
     return [
@@ -206,7 +212,7 @@ def fusion_views(
             camera=view.camera,
             cam_from_world=view.cam_from_world,
             neighbours=tuple(position[n] for n in neighbours[view.name] if n in position),
-            load=lambda view=view: _masked(read_view(paths, view.name), view),  # type: ignore[misc]
+            load=lambda view=view: _masked(read_view(paths, view.name, agreed), view),  # type: ignore[misc]
             reach=(reach or {}).get(view.name, math.inf),
         )
         for view in views
@@ -248,18 +254,25 @@ def reaches(tracks: Tracks, views: Sequence[View]) -> dict[str, float]:
     return found
 
 
-def read_view(paths: DensePaths, name: str) -> FusionMaps:
-    """The image of a view and its own maps, as :func:`write_view` and :func:`write_maps` wrote them.
+def read_view(paths: DensePaths, name: str, agreed: bool = False) -> FusionMaps:
+    """The image of a view and its maps, as :func:`write_view` and :func:`write_maps` wrote them.
+
+    Args:
+        paths: the dense workspace.
+        name: of the view.
+        agreed: the maps that the views agreed on, and how exact these are, instead of the view's own.
 
     Raises:
         InputError: a file is missing or damaged.
     """
-    depth, normal = (read_map(path) for path in paths.own_maps(name))
+    files = (paths.depth_map(name), paths.normal_map(name)) if agreed else paths.own_maps(name)
+    depth, normal = (read_map(path) for path in files)
     return FusionMaps(
         depth=depth,
         normal=normal,
         image=read_image(paths.image(name)),
         confidence=read_map(paths.confidence_map(name)),
+        error=read_map(paths.error_map(name)) if agreed else None,
     )
 
 

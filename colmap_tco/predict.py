@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+_LEAST_ERROR = np.float32(1e-6)
+"""Standard errors are at least this, so that 0 can mean that there is none."""
+
 
 @dataclass(frozen=True)
 class ViewResult:
@@ -106,8 +109,8 @@ def predict_chunk(
         watched=[points.to(device) for points in priors.held_out],
     )
     assert priors.optimise.sparse is not None
-    together = agreed(outcome.prediction, outcome.cameras, there, priors.optimise, consensus)
-    own, prediction, moved = outcome.prediction.to("cpu"), together.to("cpu"), outcome.cameras.to("cpu")
+    together = agreed(outcome.prediction, outcome.cameras, there, priors.optimise, consensus).to("cpu")
+    own, prediction, moved = outcome.prediction.to("cpu"), together.prediction, outcome.cameras.to("cpu")
     used = errors_at_points(prediction, priors.optimise.sparse)
     held = errors_at_points(prediction, priors.held_out)
     results = {}
@@ -126,7 +129,8 @@ def predict_chunk(
             "correction": _correction(outcome, i, frame.scale),
         }
         corrected = corrected_view(view, frame.scale, cameras, moved, i)
-        maps, before = (view_maps(view, p, i, images.valid, frame.scale) for p in (prediction, own))
+        maps = view_maps(view, prediction, i, images.valid, frame.scale, together.error)
+        before = view_maps(view, own, i, images.valid, frame.scale)
         results[view.name] = ViewResult(maps, before, figures | _moved(before, maps), corrected)
     if aligned is not None:
         steps = [
@@ -169,7 +173,9 @@ def _correction(outcome: Outcome, i: int, scale: float) -> dict[str, float]:
     return {**{name: values[i] for name, values in sizes.items()}, "centre": sizes["centre"][i] * scale}
 
 
-def view_maps(view: View, prediction: Prediction, i: int, valid: Tensor, scale: float) -> ViewMaps:
+def view_maps(
+    view: View, prediction: Prediction, i: int, valid: Tensor, scale: float, error: Tensor | None = None
+) -> ViewMaps:
     """Depth in COLMAP units, normals and confidence of one view, 0 and 1 where the image is not valid.
 
     Args:
@@ -178,11 +184,17 @@ def view_maps(view: View, prediction: Prediction, i: int, valid: Tensor, scale: 
         i: index of the view in the prediction.
         valid: (V, H, W) bool, the chunk's ``Views.valid``.
         scale: COLMAP units per unit of the chunk.
+        error: (V, H, W) of an :class:`tco.consensus.Agreement`, if the prediction is of one.
     """
     there = crop(view, valid[i]).numpy()
     depth = np.where(there, crop(view, prediction.depth[i]).numpy() * scale, 0).astype(np.float32)
     confidence = np.where(there, crop(view, prediction.confidence[i]).numpy(), 1).astype(np.float32)
-    return ViewMaps(depth, normals_from_depth(depth, view.network), confidence)
+    normal = normals_from_depth(depth, view.network)
+    if error is None:
+        return ViewMaps(depth, normal, confidence)
+    spread = crop(view, error[i]).numpy()
+    known = there & np.isfinite(spread)
+    return ViewMaps(depth, normal, confidence, np.where(known, np.maximum(spread, _LEAST_ERROR), 0))
 
 
 def corrected_view(view: View, scale: float, before: Cameras, after: Cameras, i: int) -> View:

@@ -246,7 +246,7 @@ def _all_there(paths: DensePaths, name: str) -> bool:
 def _files(paths: DensePaths, name: str) -> tuple[Path, ...]:
     """Every file of a view."""
     maps = (paths.depth_map(name), paths.normal_map(name), *paths.own_maps(name))
-    return paths.image(name), paths.confidence_map(name), *maps
+    return paths.image(name), paths.confidence_map(name), paths.error_map(name), *maps
 
 
 def _restore(final: DensePaths, aside: DensePaths) -> None:

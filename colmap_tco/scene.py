@@ -2,8 +2,9 @@
 
     scene = open_scene(Path("workspace"))
     outcome = optimize(load_sweep(), scene.views, scene.priors)
-    cloud, report = scene.fuse(outcome.prediction)
-    maps = scene.maps(scene.agreed(outcome.prediction, outcome.cameras))
+    together = scene.agreed(outcome.prediction, outcome.cameras)
+    cloud, report = scene.fuse(outcome.prediction, together)
+    maps = scene.maps(together.prediction)
 
 For experiments on scenes that fit the memory. ``colmap_tco.densify`` does the same in chunks, writes files,
 and goes on after an interruption.
@@ -30,8 +31,11 @@ from colmap_tco.workspace import open_workspace
 from tco.options import ConsensusConfig
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from colmap_tco._pycolmap import Floats
     from colmap_tco.fusion_report import FusionReport
+    from tco.consensus import Agreement
     from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
 
 
@@ -55,17 +59,22 @@ class Scene:
     priors: Priors
     held_out: tuple[SparseDepth, ...]
 
-    def maps(self, prediction: Prediction) -> list[ViewMaps]:
-        """Depths in COLMAP units, normals and confidences of all V views, which the prediction is of."""
+    def maps(self, prediction: Prediction, error: Tensor | None = None) -> list[ViewMaps]:
+        """Depths in COLMAP units, normals and confidences of all V views, which the prediction is of.
+
+        Args:
+            prediction: of V views.
+            error: (V, H, W) of an :class:`tco.consensus.Agreement`, if the prediction is of one.
+        """
         scale, valid = self.frame.scale, self.views.valid
-        return [view_maps(view, prediction, i, valid, scale) for i, view in enumerate(self.images)]
+        return [view_maps(view, prediction, i, valid, scale, error) for i, view in enumerate(self.images)]
 
     def agreed(
         self,
         prediction: Prediction,
         cameras: Cameras | None = None,
         config: ConsensusConfig = ConsensusConfig(),
-    ) -> Prediction:
+    ) -> Agreement:
         """What the V views say together of the depths: what ``densify`` writes as maps.
 
         Args:
@@ -80,19 +89,28 @@ class Scene:
         return agreed(prediction, cameras, self.views, self.priors, config)
 
     def fuse(
-        self, prediction: Prediction, config: FusionConfig = FusionConfig()
+        self,
+        prediction: Prediction,
+        together: Agreement | None = None,
+        config: FusionConfig = FusionConfig(),
     ) -> tuple[Cloud, FusionReport]:
         """The cloud of a prediction of all V views, in COLMAP's frame.
 
-        Fusion asks how many views found the same by themselves: give it what optimisation gives, not what
-        :meth:`agreed` makes of that.
+        Args:
+            prediction: what optimisation gives: fusion asks how many views found the same by themselves.
+            together: what :meth:`agreed` makes of that, for the gaps; None: they stay.
+            config: settings.
 
         Raises:
             EmptyCloudError: no point is left; the message names the filter that removed most.
         """
         pairs = covisibility(self.tracks, [view.image_id for view in self.images])
         sources = source_views(pairs, config.check_num_images)
-        return fuse(fusion_views(self.images, self.maps(prediction), sources, self.tracks), config)
+        views = fusion_views(self.images, self.maps(prediction), sources, self.tracks)
+        if together is None:
+            return fuse(views, config)
+        maps = self.maps(together.prediction, together.error)
+        return fuse(views, config, agreed=fusion_views(self.images, maps, sources, self.tracks))
 
     def chunk_plane(self, plane: Sequence[float]) -> Floats:
         """The plane n·X + d = 0 of COLMAP's frame in the chunk's: (4,), its normal of length one.
@@ -152,7 +170,7 @@ def fusion_views(
 
     def load(i: int) -> FusionMaps:
         picture, _ = undistorted_image(images[i])
-        return FusionMaps(maps[i].depth, maps[i].normal, picture, maps[i].confidence)
+        return FusionMaps(maps[i].depth, maps[i].normal, picture, maps[i].confidence, error=maps[i].error)
 
     return [
         FusionView(

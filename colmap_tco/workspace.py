@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -106,13 +106,16 @@ class DensePaths:
 
     def own_maps(self, name: str) -> tuple[Path, Path]:
         """Depth and normal map from before the other images were asked, which COLMAP calls photometric."""
-        folders = ("depth_maps", "normal_maps")
-        depth, normal = (self.stereo / folder / f"{name}.photometric.bin" for folder in folders)
-        return depth, normal
+        file = f"{name}.photometric.bin"
+        return self.stereo / "depth_maps" / file, self.stereo / "normal_maps" / file
 
     def confidence_map(self, name: str) -> Path:
         """The confidence of the depth map, in the same format; COLMAP ignores the folder."""
         return self.stereo / "confidence_maps" / f"{name}.geometric.bin"
+
+    def error_map(self, name: str) -> Path:
+        """The standard error of the depth map, in the same format; COLMAP ignores the folder."""
+        return self.stereo / "error_maps" / f"{name}.geometric.bin"
 
 
 @dataclass(frozen=True)
@@ -336,13 +339,12 @@ def _size(model: Model) -> str:
     return f"{model.num_reg_images()} images, {len(model.points3D)} points"
 
 
-def check_images(folder: Path, entries: Iterable[Registered], num_threads: int = -1) -> dict[str, str]:
+def check_images(folder: Path, entries: Sequence[Registered], num_threads: int = -1) -> dict[str, str]:
     """Name → reason for the registered images that cannot be used.
 
     Every file is decoded to its end, at the lowest resolution that the format allows, because a
     truncated JPEG otherwise passes as an image with a grey lower part.
     """
-    entries = list(entries)
     workers = num_threads if num_threads > 0 else os.cpu_count() or 1
     with ThreadPoolExecutor(workers) as pool:
         reasons = pool.map(lambda entry: _image_fault(folder / entry.name, entry), entries)
@@ -380,8 +382,7 @@ def decoded_size(path: Path) -> tuple[int, int]:
             image.draft("RGB", (image.width // 8, image.height // 8))
             image.load()
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
-        remedy = "copy it again or convert it to JPEG or PNG"
-        raise InputError(f"{path}: cannot be decoded ({error}); {remedy}") from error
+        raise InputError(f"{path}: cannot be decoded ({error}); copy it again or convert it") from error
     return size
 
 

@@ -53,17 +53,19 @@ def reconstruct(root: Path, size: int, config: TCOConfig) -> tuple[Cloud, dict[s
 
     # Consensus: each pixel's depth by what all views that see the place say of it.
     together = agreed(outcome.prediction, outcome.cameras, views, priors.optimise, ConsensusConfig())
-    errors = torch.cat(errors_at_points(together, priors.held_out))
+    errors = torch.cat(errors_at_points(together.prediction, priors.held_out))
 
     # Back to COLMAP's units, with a normal for each depth.
     own, maps = (
-        [view_maps(v, prediction, i, views.valid, frame.scale) for i, v in enumerate(images)]
-        for prediction in (outcome.prediction, together)
+        [view_maps(v, prediction, i, views.valid, frame.scale, error) for i, v in enumerate(images)]
+        for prediction, error in ((outcome.prediction, None), (together.prediction, together.error))
     )
 
-    # Fusion: what several views found each by itself, coloured from the full images.
+    # Fusion: what several views found each by itself, gaps filled with what they agreed on; coloured from the
+    # full images.
     neighbours = source_views(covisibility(tracks, [view.image_id for view in images]), 50)
-    cloud, report = fuse(fusion_views(images, own, neighbours, tracks))
+    own_views, agreed_views = (fusion_views(images, m, neighbours, tracks) for m in (own, maps))
+    cloud, report = fuse(own_views, agreed=agreed_views)
     print({name: count for name, count in report.pixels.items() if count})
     return cloud, {view.name: result for view, result in zip(images, maps, strict=True)}, errors
 

@@ -13,7 +13,8 @@ pixel's depth that is an error D_j / d times as large, so that the weight is c_j
 better.
 
 What agrees afterwards is no evidence any more, for all views were asked: who wants to know what the views
-found independently of each other, as fusion does, takes the depths from before.
+found independently of each other, as fusion does, takes the depths from before. How far apart they were is
+kept as the standard error of what they say together, 1.4826 MAD / √n for n views.
 
 Medians of aligned depth maps: Merrell et al., Real-time visibility-based fusion of depth maps, ICCV 2007.
 """
@@ -21,7 +22,7 @@ Medians of aligned depth maps: Merrell et al., Real-time visibility-based fusion
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -43,13 +44,35 @@ HALF = 0.5 * (1 - 1e-6)
 two, however they are rounded."""
 BAND = 1 << 15
 """Pixels of a view that ask together; memory grows with them times the views that are asked."""
+FEWEST = 5
+"""Views, the one that asks among them, whose spread says how exact they are together."""
+SIGMA_OF_MAD = 1.4826
+"""Standard deviation of a normal distribution by its median absolute deviation."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What the views say together.
+
+    Attributes:
+        prediction: with the depths moved.
+        error: (V, H, W) relative standard error of these depths by how far apart the views were; infinite
+            where fewer than ``FEWEST`` spoke. What all of them get wrong alike it does not know of.
+    """
+
+    prediction: Prediction
+    error: Tensor
+
+    def to(self, device: torch.device | str) -> Agreement:
+        """The same on another device."""
+        return Agreement(self.prediction.to(device), self.error.to(device))
 
 
 @torch.no_grad()
 def agreed(
     prediction: Prediction, cameras: Cameras, views: Views, priors: Priors, config: ConsensusConfig
-) -> Prediction:
-    """The prediction with the depths of all wanted views moved to what the views say together.
+) -> Agreement:
+    """The depths of all wanted views moved to what the views say together, and how sure of it they are.
 
     Args:
         prediction: of all V views. Confidences weigh what a view says, and stay as they are; a depth that is
@@ -67,13 +90,14 @@ def agreed(
         raise ValueError(f"all {len(views)} views must be predicted to agree, not {len(prediction.depth)}")
     if priors.overlap is None:
         raise ValueError("which views to ask is not known: there is no overlap among the priors")
+    error = torch.full_like(prediction.depth, math.inf)
     if config.consensus_rounds == 0 or len(views) < 2:
-        return prediction
+        return Agreement(prediction, error)
     consequence = "views are not asked for each other's depths (--consensus_uncertainty)"
     if priors.cameras is not None and too_uncertain(
         priors, views.size, config.consensus_uncertainty, consequence
     ):
-        return prediction
+        return Agreement(prediction, error)
     known = torch.isfinite(prediction.depth) & (prediction.depth > 0)
     depth = prediction.depth.where(known, torch.ones_like(prediction.depth))
     counts = (views.valid & known & smooth(depth)).to(depth)
@@ -82,9 +106,10 @@ def agreed(
     for view in views.wanted:
         others = most_overlapping(priors.overlap, view, config.consensus_views)
         if others:
-            asked = _asked(evidence, cameras, view, others, config)
+            asked, spread = _asked(evidence, cameras, view, others, config)
             moved[view] = asked.where(known[view], moved[view])
-    return replace(prediction, depth=moved, stages=())
+            error[view] = spread.where(known[view], error[view])
+    return Agreement(replace(prediction, depth=moved, stages=()), error)
 
 
 def smooth(depth: Tensor) -> Tensor:
@@ -96,8 +121,8 @@ def smooth(depth: Tensor) -> Tensor:
 
 def _asked(
     evidence: Tensor, cameras: Cameras, view: int, others: list[int], config: ConsensusConfig
-) -> Tensor:
-    """Depth (H, W) of a view after all rounds.
+) -> tuple[Tensor, Tensor]:
+    """Depth (H, W) of a view after all rounds, and its relative standard error (H, W).
 
     Args:
         evidence: (V, 3, H, W) inverse depth, confidence, and 1 where the two count.
@@ -121,8 +146,9 @@ def _asked(
             said = torch.cat([torch.log(own / depth)[None], said])
             weights = torch.cat([confidence[None, band], weights])
             depth = depth * torch.exp(robust_mean(said, weights, config.consensus_width))
-        found.append(depth)
-    return torch.cat(found).reshape(h, w)
+        found.append(torch.stack([depth, standard_error(said, weights)]))
+    depth, error = torch.cat(found, 1).reshape(2, h, w)
+    return depth, error
 
 
 def _words(there: Tensor, z: Tensor, depth: Tensor, reach: float) -> tuple[Tensor, Tensor]:
@@ -150,9 +176,26 @@ def robust_mean(values: Tensor, weights: Tensor, width: float) -> Tensor:
 
     Around the median m, a value v of weight w counts w / (1 + ((v − m) / width)²).
     """
+    off = values - weighted_median(values, weights)
+    near = weights / (1 + (off / width) ** 2)
+    return (near * values).sum(0) / near.sum(0)
+
+
+def standard_error(values: Tensor, weights: Tensor) -> Tensor:
+    """Standard error (N,) of the weighted median of values (K, N), along K, by their spread.
+
+    The spread is the weighted median of the distances from the weighted median; infinite where fewer than
+    ``FEWEST`` values have any weight.
+    """
+    spread = weighted_median((values - weighted_median(values, weights)).abs(), weights)
+    count = (weights > 0).to(values).sum(0)
+    error = SIGMA_OF_MAD * spread.squeeze(0) / count.clamp_min(1).sqrt()
+    return error.where(count >= FEWEST, torch.full_like(error, math.inf))
+
+
+def weighted_median(values: Tensor, weights: Tensor) -> Tensor:
+    """Of values (K, N) along K, kept as a dimension: (1, N). The lower one where two share the middle."""
     ordered, order = values.sort(0)
     sums = weights.gather(0, order).cumsum(0)
     at = (sums < sums[-1:] * HALF).sum(0, keepdim=True).clamp_max(len(values) - 1)
-    off = values - ordered.gather(0, at)
-    near = weights / (1 + (off / width) ** 2)
-    return (near * values).sum(0) / near.sum(0)
+    return ordered.gather(0, at)

@@ -117,7 +117,7 @@ def test_the_result_is_complete(done: Done) -> None:
     assert done.result.fresh
     names = done.room.names
     expected = {f"images/{name}" for name in names}
-    for kind in ("depth", "normal", "confidence"):
+    for kind in ("depth", "normal", "confidence", "error"):
         expected |= {f"stereo/{kind}_maps/{name}.geometric.bin" for name in names}
     for kind in ("depth", "normal"):
         expected |= {f"stereo/{kind}_maps/{name}.photometric.bin" for name in names}
@@ -375,6 +375,15 @@ def test_maps_are_nearer_to_the_truth_after_the_views_were_asked(done: Done) -> 
         told = done.result.report["views"][name]["moved_by_consensus"]
         assert told == pytest.approx(float(np.median(np.abs(np.log(together / own)))), rel=0.01)
         assert told > 0
+        error = read_map(paths.error_map(name))
+        assert (
+            error.shape == own.shape and bool(((error == 0) | (error >= 1e-6)).all()) and error.max() < 0.15
+        )
+        known_error = error > 0
+        agreed = read_view(paths, name, agreed=True)
+        assert agreed.depth.tobytes() == together.tobytes() and agreed.error is not None
+        assert agreed.error.tobytes() == error.tobytes() and read_view(paths, name).error is None
+        assert known_error.mean() > 0.2
     before, after = np.mean(errors, axis=0)
     assert after < 0.95 * before
 
@@ -387,6 +396,7 @@ def test_views_that_are_not_asked_keep_their_own_maps(fresh_room: Room) -> None:
             paths.own_maps(name), (paths.depth_map(name), paths.normal_map(name)), strict=True
         ):
             assert own.read_bytes() == together.read_bytes()
+        assert not read_map(paths.error_map(name)).any()
 
 
 def test_other_settings_of_the_fusion_keep_the_depth_maps(fresh_room: Room) -> None:

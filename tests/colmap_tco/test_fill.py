@@ -116,6 +116,24 @@ def test_what_the_mask_excludes_is_neither_kept_nor_filled(made: Made, tmp_path:
     assert original[:, 1].min() > 179
 
 
+def test_the_standard_error_is_that_of_our_own_depths(made: Made, tmp_path: Path) -> None:
+    """None of what is kept, nobody was asked about it; none of what the mask excludes."""
+    view, existing = made.views[0], open_existing(config(made), made.views)
+    assert existing is not None
+    mask = np.full((360, 480), 255, np.uint8)
+    mask[:180] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    ours = maps_of(view)
+    told = np.linspace(0.001, 0.002, ours.depth.shape[1], dtype=np.float32) + 0 * ours.depth
+    for masked in (view, replace(view, mask_path=tmp_path / "mask.png")):
+        maps, _ = fill(existing, masked, replace(ours, error=told))
+        filled = (maps.depth > 0) & (maps.confidence < 30)
+        assert maps.error is not None and np.array_equal(maps.error > 0, filled)
+        columns = (np.nonzero(filled)[1] + 0.5) / filled.shape[1]
+        assert np.abs(maps.error[filled] - 0.001 * (1 + columns)).max() < 0.001 / 50
+    assert fill(existing, view, ours)[0].error is None
+
+
 def test_views_without_a_map_stay_as_they_are(made: Made) -> None:
     existing = open_existing(config(made), made.views)
     assert existing is not None and NAMES[-1] not in existing.cameras

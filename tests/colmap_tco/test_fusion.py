@@ -340,6 +340,8 @@ def removed(name: str, maps: FusionMaps) -> FusionMaps:
         return replace(maps, mask=np.zeros(maps.depth.shape, bool))
     if name == "min_confidence":
         return replace(maps, confidence=np.full(maps.depth.shape, 1.5, np.float32))
+    if name == "max_agreed_error":
+        return replace(maps, error=np.full(maps.depth.shape, 0.01, np.float32))
     if name == "no_normal":
         return replace(maps, normal=maps.normal * 0)
     if name == "max_view_angle":

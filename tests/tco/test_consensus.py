@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from tco import consensus
-from tco.consensus import agreed, robust_mean, smooth
+from tco.consensus import agreed, robust_mean, smooth, standard_error
 from tco.geometry import invert, pixel_grid, project, rays, transform, unproject
 from tco.options import ConsensusConfig
 from tco.schedule import most_overlapping
@@ -37,7 +37,7 @@ def scene_cameras(scene: Wall) -> Cameras:
 
 def together(scene: Wall, prediction: Prediction, **changes: float) -> Tensor:
     config = ConsensusConfig(**changes)  # type: ignore[arg-type]
-    return agreed(prediction, scene_cameras(scene), scene.views, scene.priors, config).depth
+    return agreed(prediction, scene_cameras(scene), scene.views, scene.priors, config).prediction.depth
 
 
 def off(depth: Tensor, truth: Tensor) -> Tensor:
@@ -62,8 +62,8 @@ def test_one_wrong_view_is_outvoted(scene: Wall) -> None:
     assert float(others.max()) < 1e-3
 
 
-def by_enough(scene: Wall, view: int, fewest: int = 3) -> Tensor:
-    """Pixels (H, W) of a view that at least so many others see."""
+def by_enough(scene: Wall, view: int, fewest: int = 3, margin: float = 1) -> Tensor:
+    """Pixels (H, W) of a view that at least so many others see, so many pixels from their borders."""
     cameras = scene_cameras(scene)
     h, w = scene.depth.shape[1:]
     points = transform(
@@ -71,7 +71,7 @@ def by_enough(scene: Wall, view: int, fewest: int = 3) -> Tensor:
     )
     local = transform(invert(cameras.world_from_cam), points.unsqueeze(0))
     xy, z = project(local, cameras.K)
-    inside = (z > 0) & ((xy > 1) & (xy < xy.new_tensor([w - 1, h - 1]))).all(-1)
+    inside = (z > 0) & ((xy > margin) & (xy < xy.new_tensor([w - margin, h - margin]))).all(-1)
     return (inside.sum(0) - 1 >= fewest).reshape(h, w)
 
 
@@ -232,9 +232,8 @@ def test_the_order_of_the_views_is_no_matter(scene: Wall) -> None:
     priors = replace(scene.priors, cameras=cameras, overlap=overlap)
     views = replace(scene.views, valid=scene.views.valid[turned])
     prediction = replace(said(scene, depth[turned]), cameras=cameras)
-    again = agreed(
-        prediction, cameras, views, replace(priors, sparse=None, centre_sigma=None), ConsensusConfig()
-    )
+    fewer = replace(priors, sparse=None, centre_sigma=None)
+    again = agreed(prediction, cameras, views, fewer, ConsensusConfig()).prediction
     torch.testing.assert_close(again.depth.flip(0), moved, rtol=1e-5, atol=0)
 
 
@@ -245,7 +244,7 @@ def test_edges_say_nothing(scene: Wall) -> None:
     moved = together(scene, said(scene, depth))
     views = replace(scene.views, valid=scene.views.valid & smooth(depth))
     expected = agreed(said(scene, depth), scene_cameras(scene), views, scene.priors, ConsensusConfig())
-    assert torch.equal(moved, expected.depth)
+    assert torch.equal(moved, expected.prediction.depth)
     assert not bool(smooth(depth)[1:].all())
 
 
@@ -301,15 +300,16 @@ def test_nothing_is_asked_where_cameras_are_uncertain(scene: Wall, caplog: pytes
     shaky = replace(scene.priors, rotation_sigma=10 * scene.priors.rotation_sigma)
     prediction = said(scene, wrong)
     same = agreed(prediction, scene_cameras(scene), scene.views, shaky, ConsensusConfig())
-    assert same is prediction and "--consensus_uncertainty" in caplog.text
+    assert same.prediction is prediction and bool(same.error.isinf().all())
+    assert "--consensus_uncertainty" in caplog.text
     wide = ConsensusConfig(consensus_uncertainty=1.0)
-    assert agreed(prediction, scene_cameras(scene), scene.views, shaky, wide) is not prediction
+    assert agreed(prediction, scene_cameras(scene), scene.views, shaky, wide).prediction is not prediction
 
 
 def test_gradients_and_stages_end_here(scene: Wall) -> None:
     prediction = said(scene, scene.depth.clone().requires_grad_())
     prediction = replace(prediction, stages=(torch.zeros(VIEWS),))
-    moved = agreed(prediction, scene_cameras(scene), scene.views, scene.priors, ConsensusConfig())
+    moved = agreed(prediction, scene_cameras(scene), scene.views, scene.priors, ConsensusConfig()).prediction
     assert not moved.depth.requires_grad and moved.stages == ()
 
 
@@ -331,7 +331,7 @@ def test_invalid_pixels_say_nothing(scene: Wall) -> None:
     views = replace(scene.views, valid=torch.ones_like(scene.views.valid))
     views.valid[1:] = False
     config = ConsensusConfig()
-    moved = agreed(said(scene, wrong), scene_cameras(scene), views, scene.priors, config)
+    moved = agreed(said(scene, wrong), scene_cameras(scene), views, scene.priors, config).prediction
     assert torch.allclose(moved.depth[0], scene.depth[0], rtol=1e-6)
 
 
@@ -339,19 +339,58 @@ def test_helpers_are_asked_and_do_not_move(scene: Wall) -> None:
     depth = scene.depth.clone()
     depth[0] *= 1.05
     views = replace(scene.views, helpers=3)
-    moved = agreed(said(scene, depth), scene_cameras(scene), views, scene.priors, ConsensusConfig())
-    assert torch.equal(moved.depth[-3:], depth[-3:])
+    found = agreed(said(scene, depth), scene_cameras(scene), views, scene.priors, ConsensusConfig())
+    moved = found.prediction
+    assert torch.equal(moved.depth[-3:], depth[-3:]) and bool(found.error[-3:].isinf().all())
     assert float(off(moved.depth[0], scene.depth[0])[by_enough(scene, 0)].median()) < 2e-3
 
 
 def test_no_rounds_and_single_views_change_nothing(scene: Wall) -> None:
     prediction = said(scene, 1.02 * scene.depth)
     off_switch = ConsensusConfig(consensus_rounds=0)
-    assert agreed(prediction, scene_cameras(scene), scene.views, scene.priors, off_switch) is prediction
+    same = agreed(prediction, scene_cameras(scene), scene.views, scene.priors, off_switch)
+    assert same.prediction is prediction and bool(same.error.isinf().all())
     assert scene.priors.overlap is not None
     alone = replace(scene.priors, overlap=torch.zeros_like(scene.priors.overlap))
-    moved = agreed(prediction, scene_cameras(scene), scene.views, alone, ConsensusConfig())
+    moved = agreed(prediction, scene_cameras(scene), scene.views, alone, ConsensusConfig()).prediction
     assert torch.equal(moved.depth, prediction.depth)
+
+
+def test_standard_error_by_hand() -> None:
+    values = torch.tensor([[0.0], [0.1], [0.2], [-0.3], [5.0]], dtype=F64)
+    weights = torch.tensor([[2.0], [1.0], [1.0], [1.0], [1.0]], dtype=F64)
+    # In order −0.3 (1), 0 (3 of 6: the median). Distances 0 (2), 0.1 (3 of 6: the median), 0.2, 0.3, 5.
+    expected = 1.4826 * 0.1 / 5**0.5
+    assert float(standard_error(values, weights)) == pytest.approx(expected, rel=1e-12)
+    weights[4] = 0  # four are too few to say
+    assert float(standard_error(values, weights)) == float("inf")
+
+
+def test_standard_error_of_normal_noise_is_that_of_a_median() -> None:
+    """A median of n normal values has the standard deviation σ √(π / 2n); the MAD knows σ."""
+    generator = torch.Generator().manual_seed(8)
+    values = 0.01 * torch.randn(15, 20_000, generator=generator, dtype=F64)
+    weights = torch.ones_like(values)
+    told = float(standard_error(values, weights).median())
+    assert told == pytest.approx(0.01 / 15**0.5, rel=0.1)
+    found = float(robust_mean(values, weights, 0.02).std())
+    assert told == pytest.approx(found, rel=0.2)
+
+
+def test_the_error_is_what_is_left_of_the_noise(scene: Wall) -> None:
+    """Where all views see the wall, and infinite where fewer than five do."""
+    generator = torch.Generator().manual_seed(9)
+    coarse = torch.randn(VIEWS, 1, 6, 8, generator=generator)
+    noise = torch.nn.functional.interpolate(coarse, scene.depth.shape[1:], mode="bilinear")[:, 0]
+    depth = scene.depth * (0.01 * noise / noise.std()).exp()
+    found = agreed(said(scene, depth), scene_cameras(scene), scene.views, scene.priors, ConsensusConfig())
+    all_see = by_enough(scene, 3, VIEWS - 1)
+    real = off(found.prediction.depth, scene.depth)[3][all_see].square().mean().sqrt()
+    told = found.error[3][all_see].square().mean().sqrt()
+    assert float(told / real) == pytest.approx(1, rel=0.4)
+    few = ~by_enough(scene, 0, 4, margin=-1)
+    assert bool(few.any()) and bool(found.error[0][few].isinf().all())
+    assert bool(found.error[0][by_enough(scene, 0, 4)].isfinite().all())
 
 
 def test_robust_mean_by_hand() -> None:
