@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_tco.cli import main as colmap_tco
+from colmap_tco.errors import PartlyDoneError
 from colmap_tco.maps import read_map
 from examples.picture import cloud_picture
 from training.scenes import Sample, walk
@@ -70,7 +71,7 @@ def main() -> int:
     names = write_images(sample, args.folder / "images")
     code = colmap_tco(["densify", str(args.folder), *rest])
     dense = args.folder / "dense-tco"
-    if not (dense / "fused.ply").exists():
+    if code not in (0, PartlyDoneError.exit_code):  # what is there, if anything, is of an earlier run
         return code
     figures = accuracy(sample, names, dense)
     cv2.imwrite(str(args.folder / "cloud.png"), cloud_picture(dense)[..., ::-1])
