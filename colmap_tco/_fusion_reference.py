@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from colmap_tco import _fusion_kernels, _merge_kernels, _vote_kernels
 from colmap_tco._fusion_shelf import Shelf, ShelfView
@@ -20,6 +20,9 @@ from colmap_tco.fusion_config import FusionConfig
 from colmap_tco.fusion_input import FusionView, centre, other_from_reference
 from colmap_tco.fusion_report import FusionReport, Tolerance
 from colmap_tco.ply import Cloud, Visibility, join
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 _BLOCK = 1 << 20
 """Pixels of a reference that are voted on together; bounds the memory of the votes (some 90 MB)."""

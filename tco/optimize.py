@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from tco.adam import Adam
 from tco.backbones.base import Backbone
 from tco.context import Freshness, detached, merged
 from tco.corrections import CameraCorrections
@@ -25,6 +26,9 @@ from tco.terms import COMPATIBILITY, ExtraTerm, Terms, errors_at, means
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
 
 logger = logging.getLogger(__name__)
+
+BETAS = (0.9, 0.999)
+"""Decay of Adam's means, as the paper's code leaves it."""
 
 Report = Callable[[int, dict[str, float]], None]
 
@@ -159,16 +163,13 @@ class _Run:
     def prepare(self, parameters: Sequence[torch.nn.Parameter]) -> None:
         """Optimiser over the adapters and the camera corrections; remember the start as the best state."""
         c = self.config
-        groups: list[dict[str, Any]] = [
-            {"params": list(parameters), "lr": c.rate},
-            {"params": list(self.free.parameters()), "lr": c.ablation.free_rate},
-        ]
+        groups = [(list(parameters), c.rate), (list(self.free.parameters()), c.ablation.free_rate)]
         if self.corrections is not None:
-            groups.append({"params": list(self.corrections.parameters()), "lr": c.camera_rate})
-        self.parameters = [p for group in groups for p in group["params"]]
+            groups.append((list(self.corrections.parameters()), c.camera_rate))
+        self.parameters = [p for params, _ in groups for p in params]
         if not self.parameters:
             raise ValueError("there is nothing to optimise: no adapters, no camera_rate, no free pixels")
-        self.optimiser = torch.optim.Adam([group for group in groups if group["params"]])
+        self.optimiser = Adam([group for group in groups if group[0]], BETAS)
         self.active: tuple[str, ...] = ()
         self.best, self.best_loss = self._state(), math.inf
 
@@ -197,7 +198,7 @@ class _Run:
         if not loss.requires_grad:
             self.history.append({"loss": float(loss)})
             return self.history[-1]
-        self.optimiser.zero_grad(set_to_none=True)
+        self.optimiser.zero_grad()
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.config.clip)
         figures = {
@@ -216,8 +217,8 @@ class _Run:
                 "step %d: the loss or its gradient is not finite; back to the best state so far", number
             )
             self._roll_back(number)
-            for group in self.optimiser.param_groups:
-                group["lr"] *= 0.5
+            for group in self.optimiser.groups:
+                group.lr *= 0.5
             return
         if loss < self.best_loss:
             self.best, self.best_loss = self._state(), loss

@@ -22,6 +22,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from tco.adam import Adam
 from tco.geometry import pixel_grid
 from tco.options import TCOConfig
 from tco.schedule import Sources, draw_targets
@@ -109,14 +110,13 @@ def polish(
     """
     c = config.polish
     run = _Polishing(prediction, cameras, terms, config, generator, watched)
-    optimiser = torch.optim.Adam(run.field.parameters(), c.polish_rate, BETAS)
+    optimiser = Adam([(run.field.parameters(), c.polish_rate)], BETAS)
     history: list[dict[str, float]] = []
     skipped: list[int] = []
     steps = c.steps(len(terms.views.wanted))
     for step in range(steps):
-        for group in optimiser.param_groups:
-            group["lr"] = c.polish_rate * (1 - (1 - LAST_RATE) * step / steps)
-        optimiser.zero_grad(set_to_none=True)
+        optimiser.groups[0].lr = c.polish_rate * (1 - (1 - LAST_RATE) * step / steps)
+        optimiser.zero_grad()
         figures = {"loss": 0.0} | {name: float(value) for name, value in run.gradients().items()}
         if _finite(run.field, figures["loss"]):
             optimiser.step()
