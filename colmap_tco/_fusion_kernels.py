@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-KEEP, NO_DEPTH, MASKED, LOW_CONFIDENCE, INEXACT, NO_NORMAL, GRAZING, EDGE, FAR, NOT_FINITE = range(10)
+KEEP, NO_DEPTH, MASKED, LOW_CONFIDENCE, NO_NORMAL, GRAZING, EDGE, FAR, NOT_FINITE = range(9)
 """Why a pixel takes no part, as :func:`pack` counts it."""
 
 CHANNELS = 5
@@ -22,11 +22,10 @@ A pair is (24,): the six numbers of :func:`camera` of the reference, those of th
 (3, 4) transform from the first to the second, row by row.
 """
 
-Floats = NDArray[np.float32]
-Maps = tuple[Floats, Floats, Floats, NDArray[np.bool_], Floats]
-"""Depth (H, W), normal (H, W, 3), confidence (H, W), and mask and standard error, (H, W) or (0, 0) for none.
-Kernels take tuples, not classes of ours: numba's cache on disk would name the class,
-and fail to load once a later version has renamed it."""
+Maps = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]
+"""Depth (H, W), normal (H, W, 3), confidence (H, W), and a mask (H, W) or (0, 0) for none. Kernels take
+tuples, not classes of ours: numba's cache on disk would name the class, and fail to load once a later
+version has renamed it."""
 
 
 def camera(intrinsics: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -85,11 +84,11 @@ def _surface_marks(
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _depth_marks(
-    maps: Maps, bounds: tuple[float, float, float, float, float], row: int, marks: NDArray[np.uint8]
+    maps: Maps, bounds: tuple[float, float, float, float], row: int, marks: NDArray[np.uint8]
 ) -> None:
     """Complete the marks (W,) of a row by depth and confidence; the first reason of :data:`KEEP`… counts."""
-    depth, _, confidence, _, _ = maps
-    least, bend, _, farthest, _ = bounds
+    depth, _, confidence, _ = maps
+    least, bend, _, farthest = bounds
     height, width = depth.shape
     above, below = (row - 1, row + 1) if 0 < row < height - 1 else (row, row)
     for col in range(1, width - 1):
@@ -108,7 +107,7 @@ def _depth_marks(
 def pack(
     maps: Maps,
     camera: NDArray[np.float64],
-    bounds: tuple[float, float, float, float, float],
+    bounds: tuple[float, float, float, float],
     rows: tuple[int, int],
     packed: NDArray[np.float32],
     counts: NDArray[np.int64],
@@ -116,18 +115,16 @@ def pack(
     """Fill ``rows`` of ``packed`` (H, W, 5), with a depth of 0 where a pixel takes no part.
 
     ``bounds``: least confidence, largest relative second difference of the inverse depth, least
-    cosine between the normal and the direction to the camera, largest depth, largest standard error where
-    one is given. ``counts`` (10,) tells how many pixels have each mark, and how many values are NOT_FINITE.
+    cosine between the normal and the direction to the camera, largest depth. ``counts`` (9,) tells how
+    many pixels have each mark, and how many values are NOT_FINITE.
     """
-    depth, normal, confidence, mask, error = maps
+    depth, normal, confidence, mask = maps
     marks = np.empty(depth.shape[1], np.uint8)
     for row in range(rows[0], rows[1]):
         _surface_marks(maps, camera, bounds[2], row, marks)
         _depth_marks(maps, bounds, row, marks)
         for col in range(depth.shape[1]):
             mark = marks[col]
-            if error.size > 0 and mark != NO_DEPTH and not 0.0 < error[row, col] <= bounds[4]:
-                mark = np.uint8(INEXACT)
             if mask.size > 0 and not mask[row, col]:
                 mark = np.uint8(MASKED)
             counts[mark] += 1

@@ -9,20 +9,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_tco import _fusion_kernels, _merge_kernels, _vote_kernels
+from colmap_tco._fusion_gaps import Covered
 from colmap_tco._fusion_shelf import Shelf, ShelfView
 from colmap_tco.fusion_config import FusionConfig
 from colmap_tco.fusion_input import FusionView, centre, other_from_reference
 from colmap_tco.fusion_report import FusionReport, Tolerance
 from colmap_tco.ply import Cloud, Visibility, join
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
 
 _BLOCK = 1 << 20
 """Pixels of a reference that are voted on together; bounds the memory of the votes (some 90 MB)."""
@@ -32,9 +29,6 @@ _COLOR_SAMPLES = 15
 """Views that a colour is the median of, at most."""
 _FEWEST_VIEWS = 3
 """Where fewer views than ``min_num_pixels`` can see a point, all of them but at least these must agree."""
-
-_GAP = 1.2
-"""Distance, in pixels, from which on there is a gap between two points: pixels side by side are 1 apart."""
 
 Group = list[tuple[int, ShelfView]]
 """Neighbours that are in memory together, with their slots."""
@@ -94,10 +88,7 @@ class Reference:
         position: int,
         config: FusionConfig,
         tolerance: Tolerance,
-        covered: cKDTree | None = None,
     ) -> None:
-        """The view at this position; points near those that are ``covered``, if given, are left out."""
-        self._covered = covered
         self._shelf, self._views, self._position = shelf, views, position
         self._config, self._tolerance = config, tolerance
         # A set in ascending order: the result does not depend on the order within the list.
@@ -105,23 +96,23 @@ class Reference:
         self._own = shelf.get(position)
         self._transforms = [other_from_reference(views[n], views[position]) for n in self._neighbours]
 
-    def fuse(self, report: FusionReport) -> Cloud:
-        """The points of the view; ``report`` tells of its pixels."""
+    def fuse(self, report: FusionReport, noted: Covered | None = None) -> Cloud:
+        """The points of the view; ``report`` tells of its pixels, and ``noted`` is told of its points."""
         own = self._own
         for reason, count in own.dropped.items():
             report.pixels[reason] += count
         report.pixels["all"] += own.taken.size
         pixels = np.empty(own.taken.size, np.int64)
         found, valid = _fusion_kernels.free(own.packed, own.taken, pixels)
-        report.pixels["already_fused"] += valid - found
+        report.pixels["already_fused"] += valid - found - own.dropped.get("max_agreed_error", 0)
         pixels = pixels[:found]
         cloud = join(
             c for first in range(0, found, _BLOCK) for c in self._fuse(pixels[first : first + _BLOCK], report)
         )
+        if noted is not None:
+            noted.add(self._position, cloud.points, own.camera)
         if self._config.roi:
             cloud = self._crop(cloud, report)
-        if self._covered is not None:
-            cloud = self._in_gaps(cloud, self._covered, report)
         report.points[self._views[self._position].name] = len(cloud)
         report.pixels["points"] += len(cloud)
         return cloud
@@ -132,16 +123,6 @@ class Reference:
         inside = np.flatnonzero(((cloud.points >= low) & (cloud.points <= high)).all(1))
         report.pixels["roi"] += len(cloud) - len(inside)
         return cloud.select(inside)
-
-    def _in_gaps(self, cloud: Cloud, covered: cKDTree, report: FusionReport) -> Cloud:
-        """The points with no other within ``_GAP`` pixels of this view at their depth."""
-        pose, focal = self._views[self._position].cam_from_world, self._own.camera[0]
-        depth = (cloud.points - centre(self._views[self._position])) @ pose[2, :3]
-        near, workers = _GAP * depth / focal, max(self._config.num_threads, 0) or -1
-        away, _ = covered.query(cloud.points, distance_upper_bound=near.max(initial=0), workers=workers)
-        alone = np.flatnonzero(away > near)
-        report.pixels["no_gap"] += len(cloud) - len(alone)
-        return cloud.select(alone)
 
     def _fuse(self, pixels: NDArray[np.int64], report: FusionReport) -> list[Cloud]:
         """The points of these pixels (M,), flat indices into the reference, range by range."""
@@ -209,8 +190,8 @@ class Reference:
             )
             if self._neighbours[slot] < self._position:
                 continue  # it has been the reference, and will not be again
-            pair, error = self._pair(slot, other.camera), self._tolerance.depth
-            _merge_kernels.mark_taken(points.local, found, other.packed, pair, error, other.taken)
+            pair, limits = self._pair(slot, other.camera), (self._tolerance.depth, 0.0)
+            _merge_kernels.mark_taken(points.local, found, other.packed, pair, limits, other.taken)
 
     def _finish(self, points: _Points) -> Cloud:
         """The points with their colours and visibility."""

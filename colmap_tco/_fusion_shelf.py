@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_tco import _fusion_kernels as kernels
+from colmap_tco._fusion_gaps import Covered
 from colmap_tco.fusion_config import FusionConfig
 from colmap_tco.fusion_input import FusionMaps, FusionView
 from colmap_tco.maps import map_intrinsics
@@ -20,7 +21,6 @@ _MARKS = {
     "no_depth": kernels.NO_DEPTH,
     "mask": kernels.MASKED,
     "min_confidence": kernels.LOW_CONFIDENCE,
-    "max_agreed_error": kernels.INEXACT,
     "no_normal": kernels.NO_NORMAL,
     "max_view_angle": kernels.GRAZING,
     "max_depth_bend": kernels.EDGE,
@@ -65,8 +65,17 @@ class Shelf:
     are held all the same.
     """
 
-    def __init__(self, views: Sequence[FusionView], config: FusionConfig, workers: Workers) -> None:
+    def __init__(
+        self,
+        views: Sequence[FusionView],
+        config: FusionConfig,
+        workers: Workers,
+        covered: tuple[Covered, float] | None = None,
+    ) -> None:
+        """Of these views; for ``covered`` see :func:`colmap_tco.fusion.fuse_views`."""
         self.workers = workers
+        self._covered = covered
+        self._finished = 0
         self.loads = 0
         self.peak_bytes = 0
         self._views = views
@@ -95,8 +104,9 @@ class Shelf:
         return self._held[position]
 
     def finish(self, position: int) -> None:
-        """Forget which pixels of a view are taken: it has been the reference."""
+        """Forget which pixels of a view are taken: it has been the reference, and those before it."""
         self._taken.pop(position, None)
+        self._finished = position + 1
 
     def together(self, reference: int, others: Sequence[int]) -> Iterator[list[tuple[int, ShelfView]]]:
         """The other views with their numbers, in runs of as many as fit beside the reference, at least one.
@@ -155,7 +165,10 @@ class Shelf:
         counts = np.sum(self.workers.run(shape[0], _ROWS, pack), 0)
         if counts[kernels.NOT_FINITE]:
             raise ValueError(f"{view.name}: depths and normals must be finite; mark missing ones with 0")
+        dropped = {name: int(counts[mark]) for name, mark in _MARKS.items()}
         taken = np.zeros(shape, np.uint8)
+        if self._covered is not None and position >= self._finished:
+            dropped["max_agreed_error"] = self._start(position, maps, packed, camera, taken)
         if position in self._taken:
             taken = np.unpackbits(self._taken.pop(position), count=taken.size).reshape(shape)
         return ShelfView(
@@ -164,8 +177,29 @@ class Shelf:
             np.ascontiguousarray(maps.image),
             kernels.camera(map_intrinsics(view.camera, maps.image.shape)),
             taken,
-            {name: int(counts[mark]) for name, mark in _MARKS.items()},
+            dropped,
         )
+
+    def _start(
+        self,
+        position: int,
+        maps: FusionMaps,
+        packed: NDArray[np.float32],
+        camera: NDArray[np.float64],
+        taken: NDArray[np.uint8],
+    ) -> int:
+        """Mark the pixels that shall make no point as taken, and count those whose error is why."""
+        assert self._covered is not None
+        if maps.error is None:
+            raise ValueError(
+                f"{self._views[position].name}: agreed maps need the standard error of their depths"
+            )
+        unsure = (packed[..., 0] > 0) & ~((maps.error > 0) & (maps.error <= self._config.max_agreed_error))
+        taken[unsure] = 1
+        if position not in self._taken:
+            covered, depth_error = self._covered
+            covered.mark(position, packed, camera, depth_error, taken)
+        return int(unsure.sum())
 
 
 def _arrays(maps: FusionMaps) -> kernels.Maps:
@@ -177,15 +211,13 @@ def _arrays(maps: FusionMaps) -> kernels.Maps:
         np.ascontiguousarray(maps.normal, np.float32),
         np.ascontiguousarray(confidence, np.float32),
         np.zeros((0, 0), bool) if maps.mask is None else np.ascontiguousarray(maps.mask, bool),
-        np.zeros((0, 0), np.float32) if maps.error is None else np.ascontiguousarray(maps.error, np.float32),
     )
 
 
-def _bounds(config: FusionConfig, view: FusionView) -> tuple[float, float, float, float, float]:
+def _bounds(config: FusionConfig, view: FusionView) -> tuple[float, float, float, float]:
     bend = config.max_depth_bend if config.max_depth_bend > 0 else math.inf
     far = config.max_depth_ratio * view.reach if config.max_depth_ratio > 0 else math.inf
-    cosine = math.cos(math.radians(config.max_view_angle))
-    return config.min_confidence, bend, cosine, far, config.max_agreed_error
+    return config.min_confidence, bend, math.cos(math.radians(config.max_view_angle)), far
 
 
 def _check_maps(view: FusionView, maps: FusionMaps, config: FusionConfig) -> None:

@@ -141,7 +141,7 @@ def mark_taken(
     chosen: NDArray[np.int64],
     other: NDArray[np.float32],
     pair: NDArray[np.float64],
-    depth_error: float,
+    limits: tuple[float, float],
     taken: NDArray[np.uint8],
 ) -> None:
     """Set ``taken`` (H, W) at the pixels of another view that the ``chosen`` of ``points`` (M, 3) cover.
@@ -150,16 +150,22 @@ def mark_taken(
     within that square, widened by half so that no gap remains between the squares of neighbours, are the
     same surface seen again; a view that sees it finer than two to one keeps the rest of its pixels, for
     they add detail. Threads may set the same pixel to the same 1.
+
+    ``limits``: relative depth error, and pixels that a point covers at least on each side; if these are 0,
+    the pixel that a point falls into is the same surface whatever its depth.
     """
     height, width = taken.shape
+    depth_error, least = limits
     for k in chosen:
         x, y, z = move(pair, points[k, 0], points[k, 1], points[k, 2])
         inverse = 1.0 / z
         u, v = pair[6] * (x * inverse) + pair[8], pair[7] * (y * inverse) + pair[9]
         if z <= 0.0 or not (0.0 <= u < width and 0.0 <= v < height):
             continue
-        taken[int(v), int(u)] = 1
+        if least == 0.0:
+            taken[int(v), int(u)] = 1
         reach, off = 0.75 * min(points[k, 2] * pair[4] * pair[6] * inverse, 2.0), depth_error * z
+        reach = max(reach, least)
         first, last = max(int(np.ceil(u - reach - 0.5)), 0), min(int(u + reach - 0.5), width - 1)
         for j in range(max(int(np.ceil(v - reach - 0.5)), 0), min(int(v + reach - 0.5), height - 1) + 1):
             for i in range(first, last + 1):

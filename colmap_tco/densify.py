@@ -279,6 +279,12 @@ def _existing(config: DensifyConfig, views: Sequence[View]) -> Existing | None:
     return open_existing(config.fill, views)
 
 
+def _asked(result: Result, views: Sequence[View]) -> bool:
+    """Whether there is a view of which the others were asked."""
+    told: list[Any] = [result.views[view.name] for view in views]
+    return any((figures.get("asked_by_consensus") or 0) > 0 for figures in told)
+
+
 def _nothing_used(skipped: Mapping[str, str], failed: Mapping[str, str]) -> NoReturn:
     """Say why there is no result at all."""
     if failed:
@@ -311,7 +317,7 @@ def _fuse_and_write(
 ) -> dict[str, Any]:  # fmt: skip
     """Model, lists and cloud; returns their figures for the report."""
     pairs, tracks = seen
-    filling = config.fusion.max_agreed_error > 0
+    filling = config.fusion.max_agreed_error > 0 and _asked(result, used)
     progress.stage("fusion", len(used) * (2 if filling else 1))
     names = [view.name for view in views]
     sources = source_views(pairs, config.fusion.check_num_images)
@@ -323,11 +329,9 @@ def _fuse_and_write(
     why = None
     try:
         reach = outputs.reaches(tracks, used)
-        own, agreed = (
-            outputs.fusion_views(result.paths, used, neighbours, indices, reach, agreed)
-            for agreed in (False, True)
-        )
-        cloud, fused = fuse(own, config.fusion, progress.advance, agreed)
+        own = outputs.fusion_views(result.paths, used, neighbours, indices, reach)
+        agreed = outputs.fusion_views(result.paths, used, neighbours, indices, reach, agreed=True)
+        cloud, fused = fuse(own, config.fusion, progress.advance, agreed if filling else ())
     except EmptyCloudError as error:  # the depth maps are there all the same
         cloud, fused, why = error.cloud, error.report, str(error)
     outputs.write_cloud(result.paths, cloud)

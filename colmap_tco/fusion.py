@@ -8,8 +8,8 @@ surfaces, its colour the median of their images, and the pixels of the other vie
 that it was made of are not used as references again.
 
 Where that leaves gaps, the depths that the views agreed on when they were asked for each other's
-(:mod:`tco.consensus`) go the same way, of those pixels of which the views were hardly apart, and what lies in
-a gap is added.
+(:mod:`tco.consensus`) are fused in the same way. A pixel becomes a point there if the views were hardly
+apart on it (``max_agreed_error``), and if no point of the cloud is there yet; the others vote.
 
 Views are loaded when they are needed and kept while they fit ``cache_size``, so that memory does not
 grow with the number of views. The result does not depend on the number of threads.
@@ -32,7 +32,7 @@ from colmap_tco.thin import thin
 from colmap_tco.workers import Workers
 
 if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
+    from colmap_tco._fusion_gaps import Covered
 
 __all__ = ["EmptyCloudError", "FusionConfig", "FusionMaps", "FusionView", "fuse", "fuse_views"]
 
@@ -64,23 +64,22 @@ def fuse(
         views: with what each found by itself.
         config: bounds and filters.
         fused: called after each view, of ``views`` and of ``agreed``.
-        agreed: the same views with what they agreed on and its standard error, to fill gaps.
+        agreed: the same views with what they agreed on and its standard error, to fill gaps; none: they stay.
+
+    Returns:
+        The cloud, points in gaps last, and the report.
 
     Raises:
         EmptyCloudError: no point is left; the message names the filter that removed most.
+        ValueError: as :func:`fuse_views`; ``agreed`` are other views, or have no error.
     """
-    from scipy.spatial import cKDTree
-
     config = config or FusionConfig()
-    report = FusionReport()
-    parts = _all(fuse_views(views, config, report), fused)
-    if agreed and config.max_agreed_error > 0 and report.pixels["points"]:
-        covered = cKDTree(np.concatenate([part.points for part in parts]))
-        gaps = FusionReport()
-        more = _all(fuse_views(agreed, config, gaps, covered), fused)
-        report.fill(gaps)
-        # View by view, as the report counts them.
-        parts = [part for of_view in zip(parts, more, strict=True) for part in of_view]
+    if agreed and [view.name for view in agreed] != [view.name for view in views]:
+        raise ValueError("the agreed maps are not of the same views in the same order")
+    report, parts = FusionReport(), []
+    for part in _filled(views, agreed, config, report) if agreed else fuse_views(views, config, report):
+        parts.append(part)
+        fused()
     cloud = join(parts)
     kept = thin(cloud.points, config.voxel_size, config.max_points)
     if len(kept) < len(cloud):
@@ -88,22 +87,33 @@ def fuse(
         cloud = cloud.select(kept)
     if not len(cloud):
         raise EmptyCloudError(cloud, report)
-    if report.lowered:
+    lowered = report.lowered + (report.gaps.lowered if report.gaps else 0)
+    if lowered:
         log.info("%d of %d points are confirmed by fewer than min_num_pixels=%d views, for no more see them",
-                 report.lowered, len(cloud), config.min_num_pixels)  # fmt: skip
+                 lowered, len(cloud), config.min_num_pixels)  # fmt: skip
     return cloud, report
 
 
-def _all(clouds: Iterator[Cloud], fused: Callable[[], None]) -> list[Cloud]:
-    parts = []
-    for part in clouds:
-        parts.append(part)
-        fused()
-    return parts
+def _filled(
+    views: Sequence[FusionView], agreed: Sequence[FusionView], config: FusionConfig, report: FusionReport
+) -> Iterator[Cloud]:
+    """The clouds of all views, then those that fill the gaps; arguments as of :func:`fuse`."""
+    from colmap_tco._fusion_gaps import Covered
+
+    covered = Covered(views, config.check_num_images)
+    yield from fuse_views(views, config, report, covered)
+    if config.max_agreed_error > 0 and covered:
+        assert report.tolerance is not None
+        report.gaps = FusionReport()
+        yield from fuse_views(agreed, config, report.gaps, covered=(covered, report.tolerance.depth))
 
 
 def fuse_views(
-    views: Sequence[FusionView], config: FusionConfig, report: FusionReport, covered: cKDTree | None = None
+    views: Sequence[FusionView],
+    config: FusionConfig,
+    report: FusionReport,
+    noted: Covered | None = None,
+    covered: tuple[Covered, float] | None = None,
 ) -> Iterator[Cloud]:
     """Fuse view after view: one cloud for each of ``views`` in turn, in the world frame.
 
@@ -111,7 +121,10 @@ def fuse_views(
         views: all views; their neighbours are positions in this list.
         config: bounds and filters.
         report: is filled while the clouds are taken.
-        covered: points next to which there is no gap to fill; None: every point is wanted.
+        noted: is told of the points, those outside the region of interest among them.
+        covered: the points of a cloud whose gaps are to be filled, and the relative difference of depth up to
+            which a pixel shows such a point; if given, the views have standard errors, and pixels that show
+            one, or that ``max_agreed_error`` excludes, vote and do not become points.
 
     Raises:
         ValueError: settings or neighbours out of range, or arrays of a view that do not fit together.
@@ -122,11 +135,11 @@ def fuse_views(
 
     _check(views, config)
     with Workers(config.num_threads) as workers:
-        shelf = Shelf(views, config, workers)
+        shelf = Shelf(views, config, workers, covered)
         tolerance = report.tolerance = _fusion_noise.tolerance(shelf, views, config)
         log.debug("fusion tolerates %s", tolerance)
         for position in range(len(views)):
-            cloud = Reference(shelf, views, position, config, tolerance, covered).fuse(report)
+            cloud = Reference(shelf, views, position, config, tolerance).fuse(report, noted)
             report.loads, report.peak_bytes = shelf.loads, shelf.peak_bytes
             shelf.finish(position)
             yield cloud

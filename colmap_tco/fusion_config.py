@@ -77,10 +77,10 @@ class FusionConfig:
         "are cut off, those that stay do not change. Empty: all points.",
     )
     max_agreed_error: float = knob(
-        0.002,
+        0.003,
         "Where the cloud has gaps, depths that the views agreed on are taken if their relative standard "
         "error, by how far apart the views were, is at most this. Raise it, up to 0.01, for fewer gaps and "
-        "less exact points in them. 0: the gaps stay.",
+        "rougher surfaces in them. 0: the gaps stay.",
     )
     voxel_size: float = knob(
         0.0,

@@ -24,7 +24,8 @@ class FusionMaps:
         image: (H', W', 3) uint8 RGB, undistorted, of any size with the camera's field of view.
         confidence: (H, W) at least 1, or None if there is none.
         mask: (H, W) bool, False where pixels shall take no part, or None.
-        error: (H, W) relative standard error of the depth, 0 where it is not known, or None: all take part.
+        error: (H, W) relative standard error of the depth by how far apart the views were, 0 where it is not
+            known; of agreed maps alone, others are None.
     """
 
     depth: NDArray[np.float32]

@@ -11,7 +11,7 @@ FILTERS = {
     "no_depth": "they have no depth",
     "mask": "the masks exclude them",
     "min_confidence": "their confidence is below min_confidence",
-    "max_agreed_error": "the views were too far apart on them (max_agreed_error)",
+    "max_agreed_error": "too few views spoke of them, or these were too far apart (max_agreed_error)",
     "no_normal": "no surface normal could be fitted to them",
     "max_view_angle": "their surface is seen at more than max_view_angle",
     "max_depth_bend": "they lie at discontinuities (max_depth_bend)",
@@ -24,7 +24,7 @@ FILTERS = {
 """What removes a pixel, in the order of the tests, and how a message says so."""
 AFTER_CONFIRMATION = ("min_tri_angle", "roi")
 """Filters of points that enough views agree on."""
-PIXEL_FATES = ("all", *FILTERS, "already_fused", "no_gap", "thinned", "points")
+PIXEL_FATES = ("all", *FILTERS, "already_fused", "thinned", "points")
 COMPARISONS = ("max_depth_error", "max_reproj_error", "max_normal_error")
 
 
@@ -48,13 +48,12 @@ class FusionReport:
     """Where every pixel went.
 
     Attributes:
-        pixels: all pixels, those of the agreed maps among them where gaps were filled, then those that
-            each filter removed, then those taken into points of earlier views, then those of agreed maps
-            where there was no gap, then those whose points were thinned out, then the points.
+        pixels: all pixels, then those that each filter removed, then those taken into points of
+            earlier views, then those whose points were thinned out, then the points.
         comparisons: how often a pixel and a neighbour did not agree, by the first test that failed.
         tolerance: in use, where it was widened to the noise of the depths.
-        filled: points in gaps, of the agreed maps; those thinned out included.
         points: points a reference view contributed, by name, in the order of the cloud.
+        gaps: where the pixels of the agreed maps went, if gaps were filled: its points come after these.
         lowered: points accepted by fewer than ``min_num_pixels`` views because no more could see them,
             those outside the region of interest and those thinned out included.
         loads: how often a view was read.
@@ -65,30 +64,22 @@ class FusionReport:
     comparisons: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COMPARISONS, 0))
     points: dict[str, int] = field(default_factory=dict)
     tolerance: Tolerance | None = None
-    filled: int = 0
+    gaps: FusionReport | None = None
     lowered: int = 0
     loads: int = 0
     peak_bytes: int = 0
 
     def thin(self, kept: NDArray[np.int64]) -> None:
         """Take down that of the points so far only ``kept`` (M,), ascending indices, remain."""
+        if self.gaps is not None:
+            count = self.pixels["points"]
+            self.gaps.thin(kept[kept >= count] - count)
+            kept = kept[kept < count]
         ends = np.cumsum(list(self.points.values()))
         left = np.diff(np.searchsorted(kept, ends), prepend=0)
         self.points = {name: int(count) for name, count in zip(self.points, left, strict=True)}
         self.pixels["thinned"] += self.pixels["points"] - len(kept)
         self.pixels["points"] = len(kept)
-
-    def fill(self, gaps: FusionReport) -> None:
-        """Add what became of the agreed maps where they filled gaps of the cloud."""
-        for mine, theirs in (
-            (self.pixels, gaps.pixels), (self.comparisons, gaps.comparisons), (self.points, gaps.points)
-        ):  # fmt: skip
-            for name, count in theirs.items():
-                mine[name] += count
-        self.filled += gaps.pixels["points"]
-        self.lowered += gaps.lowered
-        self.loads += gaps.loads
-        self.peak_bytes = max(self.peak_bytes, gaps.peak_bytes)
 
     def as_dict(self) -> dict[str, object]:
         """The report as plain numbers for ``report.json``."""
@@ -97,10 +88,10 @@ class FusionReport:
             "comparisons_failed": dict(self.comparisons),
             "tolerance": asdict(self.tolerance) if self.tolerance else None,
             "points_by_view": dict(self.points),
-            "points_in_gaps": self.filled,
             "points_with_fewer_views": self.lowered,
             "views_read": self.loads,
             "peak_megabytes": round(self.peak_bytes / 1e6, 1),
+            "gaps": self.gaps.as_dict() if self.gaps else None,
         }
 
 

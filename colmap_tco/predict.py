@@ -131,7 +131,7 @@ def predict_chunk(
         corrected = corrected_view(view, frame.scale, cameras, moved, i)
         maps = view_maps(view, prediction, i, images.valid, frame.scale, together.error)
         before = view_maps(view, own, i, images.valid, frame.scale)
-        results[view.name] = ViewResult(maps, before, figures | _moved(before, maps), corrected)
+        results[view.name] = ViewResult(maps, before, figures | _asked(before, maps), corrected)
     if aligned is not None:
         steps = [
             terms | {f"own_{k}": v for k, v in more.items()}
@@ -141,11 +141,15 @@ def predict_chunk(
     return ChunkResult(results, outcome.history, {})
 
 
-def _moved(before: ViewMaps, after: ViewMaps) -> dict[str, float | None]:
-    """By how much, relative, the other views moved the depths of a view."""
+def _asked(before: ViewMaps, after: ViewMaps) -> dict[str, float | None]:
+    """By how much, relative, the other views moved the depths of a view, and of what share enough spoke."""
     known = (before.depth > 0) & (after.depth > 0)
     moved = np.abs(np.log(after.depth[known] / before.depth[known]))
-    return {"moved_by_consensus": float(np.median(moved)) if moved.size else None}
+    assert after.error is not None
+    return {
+        "moved_by_consensus": float(np.median(moved)) if moved.size else None,
+        "asked_by_consensus": float((after.error > 0).mean()),
+    }
 
 
 def _paired(

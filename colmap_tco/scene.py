@@ -3,7 +3,7 @@
     scene = open_scene(Path("workspace"))
     outcome = optimize(load_sweep(), scene.views, scene.priors)
     together = scene.agreed(outcome.prediction, outcome.cameras)
-    cloud, report = scene.fuse(outcome.prediction, together)
+    cloud, report = scene.fuse(outcome.prediction, together=together)
     maps = scene.maps(together.prediction)
 
 For experiments on scenes that fit the memory. ``colmap_tco.densify`` does the same in chunks, writes files,
@@ -91,15 +91,15 @@ class Scene:
     def fuse(
         self,
         prediction: Prediction,
-        together: Agreement | None = None,
         config: FusionConfig = FusionConfig(),
+        together: Agreement | None = None,
     ) -> tuple[Cloud, FusionReport]:
         """The cloud of a prediction of all V views, in COLMAP's frame.
 
         Args:
             prediction: what optimisation gives: fusion asks how many views found the same by themselves.
-            together: what :meth:`agreed` makes of that, for the gaps; None: they stay.
             config: settings.
+            together: what :meth:`agreed` makes of that, for the gaps; None: they stay.
 
         Raises:
             EmptyCloudError: no point is left; the message names the filter that removed most.

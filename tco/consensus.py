@@ -14,7 +14,7 @@ better.
 
 What agrees afterwards is no evidence any more, for all views were asked: who wants to know what the views
 found independently of each other, as fusion does, takes the depths from before. How far apart they were is
-kept as the standard error of what they say together, 1.4826 MAD / √n for n views.
+kept as the standard error of what they say together, as if they erred each by itself.
 
 Medians of aligned depth maps: Merrell et al., Real-time visibility-based fusion of depth maps, ICCV 2007.
 """
@@ -44,10 +44,12 @@ HALF = 0.5 * (1 - 1e-6)
 two, however they are rounded."""
 BAND = 1 << 15
 """Pixels of a view that ask together; memory grows with them times the views that are asked."""
-FEWEST = 5
-"""Views, the one that asks among them, whose spread says how exact they are together."""
+FEWEST = 4.0
+"""Views, counted as (Σ w)² / Σ w², of which it takes more to tell a spread: no weight is half of all then."""
 SIGMA_OF_MAD = 1.4826
 """Standard deviation of a normal distribution by its median absolute deviation."""
+OF_MEDIAN = math.sqrt(math.pi / 2)
+"""Standard deviation of a median of many normal values, by that of their mean."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +58,9 @@ class Agreement:
 
     Attributes:
         prediction: with the depths moved.
-        error: (V, H, W) relative standard error of these depths by how far apart the views were; infinite
-            where fewer than ``FEWEST`` spoke. What all of them get wrong alike it does not know of.
+        error: (V, H, W) relative standard error of these depths if the views erred each by itself, by how
+            far apart they were; infinite where too few spoke. What they get wrong alike it does not know of,
+            so that real errors are larger (``docs/calibration.md``).
     """
 
     prediction: Prediction
@@ -72,7 +75,7 @@ class Agreement:
 def agreed(
     prediction: Prediction, cameras: Cameras, views: Views, priors: Priors, config: ConsensusConfig
 ) -> Agreement:
-    """The depths of all wanted views moved to what the views say together, and how sure of it they are.
+    """The depths of all wanted views moved to what the views say together, and how far apart these were.
 
     Args:
         prediction: of all V views. Confidences weigh what a view says, and stay as they are; a depth that is
@@ -182,20 +185,25 @@ def robust_mean(values: Tensor, weights: Tensor, width: float) -> Tensor:
 
 
 def standard_error(values: Tensor, weights: Tensor) -> Tensor:
-    """Standard error (N,) of the weighted median of values (K, N), along K, by their spread.
+    """Standard error (N,) of what values (K, N) say together, along K, by their spread: s √(π / 2n).
 
-    The spread is the weighted median of the distances from the weighted median; infinite where fewer than
-    ``FEWEST`` values have any weight.
+    s is 1.4826 times the weighted median distance from the weighted median, times n / (n − 0.8) since one
+    of few values is at no distance (Croux and Rousseeuw 1992), and n = (Σ w)² / Σ w². That is the median's,
+    and a little more than that of :func:`robust_mean`. Infinite where n is not above ``FEWEST``.
     """
-    spread = weighted_median((values - weighted_median(values, weights)).abs(), weights)
-    count = (weights > 0).to(values).sum(0)
-    error = SIGMA_OF_MAD * spread.squeeze(0) / count.clamp_min(1).sqrt()
-    return error.where(count >= FEWEST, torch.full_like(error, math.inf))
+    off = (values - weighted_median(values, weights)).abs()
+    spread = SIGMA_OF_MAD * weighted_median(off, weights, upper=True).squeeze(0)
+    count = weights.sum(0) ** 2 / (weights**2).sum(0).clamp_min(1e-30)
+    enough = count > FEWEST
+    count = count.where(enough, torch.ones_like(count))
+    error = spread * OF_MEDIAN * count.sqrt() / (count - 0.8)
+    return error.where(enough, torch.full_like(error, math.inf))
 
 
-def weighted_median(values: Tensor, weights: Tensor) -> Tensor:
-    """Of values (K, N) along K, kept as a dimension: (1, N). The lower one where two share the middle."""
+def weighted_median(values: Tensor, weights: Tensor, upper: bool = False) -> Tensor:
+    """Of values (K, N) along K, as (1, N); the lower or upper one where two share the middle."""
     ordered, order = values.sort(0)
     sums = weights.gather(0, order).cumsum(0)
-    at = (sums < sums[-1:] * HALF).sum(0, keepdim=True).clamp_max(len(values) - 1)
+    half = 1 - HALF if upper else HALF
+    at = (sums < sums[-1:] * half).sum(0, keepdim=True).clamp_max(len(values) - 1)
     return ordered.gather(0, at)

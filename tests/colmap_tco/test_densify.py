@@ -375,6 +375,7 @@ def test_maps_are_nearer_to_the_truth_after_the_views_were_asked(done: Done) -> 
         told = done.result.report["views"][name]["moved_by_consensus"]
         assert told == pytest.approx(float(np.median(np.abs(np.log(together / own)))), rel=0.01)
         assert told > 0
+        asked = done.result.report["views"][name]["asked_by_consensus"]
         error = read_map(paths.error_map(name))
         assert (
             error.shape == own.shape and bool(((error == 0) | (error >= 1e-6)).all()) and error.max() < 0.15
@@ -383,7 +384,7 @@ def test_maps_are_nearer_to_the_truth_after_the_views_were_asked(done: Done) -> 
         agreed = read_view(paths, name, agreed=True)
         assert agreed.depth.tobytes() == together.tobytes() and agreed.error is not None
         assert agreed.error.tobytes() == error.tobytes() and read_view(paths, name).error is None
-        assert known_error.mean() > 0.2
+        assert known_error.mean() == pytest.approx(asked, rel=0.01) and asked > 0.2
     before, after = np.mean(errors, axis=0)
     assert after < 0.95 * before
 
@@ -397,6 +398,8 @@ def test_views_that_are_not_asked_keep_their_own_maps(fresh_room: Room) -> None:
         ):
             assert own.read_bytes() == together.read_bytes()
         assert not read_map(paths.error_map(name)).any()
+    report = json.loads(paths.report.read_text("utf-8"))
+    assert report["fusion"]["gaps"] is None  # nobody was asked, so that there is nothing to fill them with
 
 
 def test_other_settings_of_the_fusion_keep_the_depth_maps(fresh_room: Room) -> None:
@@ -707,9 +710,10 @@ def test_an_existing_result_is_kept_and_completed_within_a_region(fresh_room: Ro
     points = read_ply(result.folder / "fused.ply")[0]
     assert 400 < len(points) <= 500
     assert (points <= np.array(box[3:]) + 1e-6).all()
-    pixels = result.report["fusion"]["pixels"]
+    pixels, gaps = result.report["fusion"]["pixels"], result.report["fusion"]["gaps"]["pixels"]
     assert pixels["roi"] > 0 < pixels["thinned"]
-    assert pixels["points"] == len(points) == len(read_vis(result.folder / "fused.ply.vis"))
+    assert len(points) == result.report["points"] == len(read_vis(result.folder / "fused.ply.vis"))
+    assert pixels["points"] + gaps["points"] == len(points)
     for i, name in enumerate(fresh_room.names):
         depth = read_map(result.folder / "stereo" / "depth_maps" / f"{name}.geometric.bin")
         assert depth.shape == (h, w)

@@ -340,8 +340,6 @@ def removed(name: str, maps: FusionMaps) -> FusionMaps:
         return replace(maps, mask=np.zeros(maps.depth.shape, bool))
     if name == "min_confidence":
         return replace(maps, confidence=np.full(maps.depth.shape, 1.5, np.float32))
-    if name == "max_agreed_error":
-        return replace(maps, error=np.full(maps.depth.shape, 0.01, np.float32))
     if name == "no_normal":
         return replace(maps, normal=maps.normal * 0)
     if name == "max_view_angle":
@@ -355,7 +353,11 @@ def removed(name: str, maps: FusionMaps) -> FusionMaps:
 
 @pytest.mark.parametrize(
     "name",
-    [n for n in FILTERS if n not in ("max_conflicts", "min_num_pixels", "min_tri_angle", "roi")],
+    [
+        n
+        for n in FILTERS
+        if n not in ("max_agreed_error", "max_conflicts", "min_num_pixels", "min_tri_angle", "roi")
+    ],
 )
 def test_an_empty_result_names_the_filter(name: str) -> None:
     views = [with_maps(view, lambda maps: removed(name, maps)) for view in Scene().views()]

@@ -48,8 +48,9 @@ const listing = (title, value, open = false) => make('details', { open }, make('
   make('table', {}, make('tbody', {}, ...flat(value).map(([key, text]) => make('tr', {}, make('th', { scope: 'row', style: 'font-weight:400' }, key), make('td', {}, text))))));
 
 function settings() {
-  const pixels = report.fusion?.pixels || {}, holder = id('settings');
-  holder.append(make('div', { class: 'two' }, bars('What became of the pixels in the fusion', Object.entries(pixels), count), bars('Time', Object.entries(report.seconds), time)),
+  const { pixels = {}, gaps } = report.fusion || {}, holder = id('settings');
+  const fates = [...Object.entries(pixels), ...(gaps ? [['points in gaps, of depths that the views agreed on', gaps.pixels.points]] : [])];
+  holder.append(make('div', { class: 'two' }, bars('What became of the pixels in the fusion', fates, count), bars('Time', Object.entries(report.seconds), time)),
     listing('Network, model and images', { backbone: report.backbone, device: report.device, ...report.workspace }),
     listing('Settings', report.settings), listing('Versions', report.versions));
   holder.append(make('footer', {}, 'Made by colmap-tco; the numbers are in report.json. This page needs no network.'));
