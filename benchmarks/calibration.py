@@ -7,6 +7,8 @@ which the mean of |error| is b; confidence is 1 + 0.02 / b. The depths are those
 optimised, and moved to what the views say together. Pixels are put into classes of b, and the mean and median
 of what a depth sensor says are set beside it. Errors above 50 % count as 50 %, as in training. The plot goes
 beside the Markdown file.
+
+A second table sets the standard error, by how far apart the views were (``error_maps``), beside the same.
 """
 
 from __future__ import annotations
@@ -25,14 +27,18 @@ from tco.optimize import optimize
 from tco.options import ConsensusConfig, TCOConfig
 
 EDGES = np.array([0.0, 0.003, 0.005, 0.0075, 0.01, 0.015, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, 1.0])
+APART = np.array([0.0, 0.0005, 0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.05, 1.0])
+"""Bounds of the classes of predicted errors, and of standard errors."""
 Row = tuple[float, float, float, float, float]
 """Share of the pixels; mean predicted error; mean and median actual error; share within 5 %."""
 
 
-def classes(predicted: NDArray[np.float64], actual: NDArray[np.float64]) -> list[Row]:
+def classes(
+    predicted: NDArray[np.float64], actual: NDArray[np.float64], edges: NDArray[np.float64] = EDGES
+) -> list[Row]:
     """One row for each class of predicted error that holds at least 200 pixels."""
-    rows, which = [], np.digitize(predicted, EDGES) - 1
-    for k in range(len(EDGES) - 1):
+    rows, which = [], np.digitize(predicted, edges) - 1
+    for k in range(len(edges) - 1):
         mine = which == k
         if mine.sum() < 200:
             continue
@@ -74,16 +80,19 @@ def main() -> None:
     parser = arguments(__doc__ or "")
     parser.set_defaults(steps=TCOConfig().steps, size=256, views=0)
     args = parser.parse_args()
-    network, curves = load_sweep(args.weights or EMBEDDED), {}
+    network = load_sweep(args.weights or EMBEDDED)
+    curves, apart = {}, {}
     for name in args.sets:
         real = load(name, args.size, args.views)
         outcome = optimize(network, real.views, real.given, TCOConfig(steps=args.steps))
         asking = ConsensusConfig()
-        prediction = agreed(outcome.prediction, outcome.cameras, real.views, real.given, asking).prediction
-        known = real.truth > 0
+        together = agreed(outcome.prediction, outcome.cameras, real.views, real.given, asking)
+        prediction, known = together.prediction, real.truth > 0
         error = (prediction.depth / real.truth.clamp_min(1e-6) - 1).abs()[known].clamp_max(0.5)
         predicted = (ERROR_UNIT / (prediction.confidence[known] - 1).clamp_min(1e-3)).to(torch.float64)
         curves[name] = classes(predicted.numpy(), error.to(torch.float64).numpy())
+        spread = together.error[known].to(torch.float64).numpy()
+        apart[name] = classes(spread, error.to(torch.float64).numpy(), APART)
     text = (
         f"# Calibration of the confidence\n\n`python -m benchmarks.calibration --steps {args.steps}`: "
         f"{args.size} pixels, {args.views or 'all'} views.\n"
@@ -92,14 +101,19 @@ def main() -> None:
         plot(curves, args.output.with_suffix(".png"))
         text += f"\n![predicted against actual error]({args.output.with_suffix('.png').name})\n"
     for name, rows in curves.items():
-        text += (
-            f"\n## {name}\n\nOff by a factor of {2 ** gap(rows):.2f} on average.\n\n"
-            "| share of pixels | predicted | actual, mean | actual, median | within 5 % |\n"
-            "|---|---|---|---|---|\n"
-        )
-        for share, b, mean, median, close in rows:
-            text += f"| {share:.3f} | {b:.4f} | {mean:.4f} | {median:.4f} | {close:.3f} |\n"
+        text += f"\n## {name}\n\nOff by a factor of {2 ** gap(rows):.2f} on average.\n\n"
+        text += table("predicted", rows) + "\n" + table("standard error", apart[name])
     publish(text, args.output)
+
+
+def table(what: str, rows: list[Row]) -> str:
+    """Classes of what was told as a Markdown table."""
+    text = (
+        f"| share of pixels | {what} | actual, mean | actual, median | within 5 % |\n|---|---|---|---|---|\n"
+    )
+    for share, told, mean, median, close in rows:
+        text += f"| {share:.3f} | {told:.4f} | {mean:.4f} | {median:.4f} | {close:.3f} |\n"
+    return text
 
 
 if __name__ == "__main__":

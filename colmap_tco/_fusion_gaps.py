@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from colmap_tco import _fusion_kernels, _merge_kernels
 from colmap_tco.fusion_input import FusionView, centre, other_from_reference
+from colmap_tco.workers import Workers
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,7 @@ class Covered:
         camera: NDArray[np.float64],
         depth_error: float,
         taken: NDArray[np.uint8],
+        workers: Workers,
     ) -> None:
         """Set ``taken`` (H, W) at the pixels of a view that a point covers at about their depth.
 
@@ -59,10 +61,14 @@ class Covered:
             camera: (6,) of these.
             depth_error: relative difference up to which pixel and point are the same surface.
             taken: is changed.
+            workers: share the views whose points these are.
         """
-        for other in sorted(self._near[position] & self._parts.keys()):
+
+        def mark(other: int) -> None:
             part = self._parts[other]
             move = other_from_reference(self._views[position], self._views[other])
             pair = _fusion_kernels.pair(part.camera, camera, move)
             every = np.arange(len(part.points))
             _merge_kernels.mark_taken(part.points, every, packed, pair, (depth_error, 0.5), taken)
+
+        workers.map(mark, sorted(self._near[position] & self._parts.keys()))

@@ -198,7 +198,7 @@ class Shelf:
         taken[unsure] = 1
         if position not in self._taken:
             covered, depth_error = self._covered
-            covered.mark(position, packed, camera, depth_error, taken)
+            covered.mark(position, packed, camera, depth_error, taken, self.workers)
         return int(unsure.sum())
 
 
