@@ -149,7 +149,7 @@ MUTATIONS = [
         ("(there[:, 2] > ALL)", "(there[:, 2] > 0.5)"),
         ("(surface < high * z)", "(surface < 100 * z)"),
         ("weights / (1 + (off / width) ** 2)", "weights"),
-        ("(sums < sums[-1:] * HALF)", "(sums < sums[-1:] * 0.9)"),
+        ("half = 1 - HALF if upper else HALF", "half = 0.9"),
         ("SIGMA_OF_MAD * weighted_median", "weighted_median"),
         ("OF_MEDIAN * count.sqrt()", "count.sqrt()"),
         ("(count - 0.8)", "count"),
@@ -159,6 +159,32 @@ MUTATIONS = [
         ("spread.where(known[view], error[view])", "spread"),
         ("config.consensus_views)", "100)"),
         ("stages=())", "stages=prediction.stages)"),
+    ),
+    *(
+        Mutation(file, old, new, ("tests/colmap_tco/test_fusion_gaps.py",))
+        for file, old, new in (
+            ("colmap_tco/_fusion_gaps.py", "(depth_error, 0.5)", "(depth_error, 0.0)"),
+            ("colmap_tco/_fusion_gaps.py", "(points - centre(view)) @", "(points + centre(view)) @"),
+            ("colmap_tco/_fusion_gaps.py", "self._near[j].add(i)", "self._near[j].add(j)"),
+            ("colmap_tco/_fusion_shelf.py", "taken[unsure] = 1", "packed[unsure, 0] = 0"),
+            ("colmap_tco/_fusion_shelf.py", "taken[unsure] = 1", "taken[unsure] = 0"),
+            ("colmap_tco/_fusion_shelf.py", "((maps.error > 0) &", "((maps.error >= 0) &"),
+            ("colmap_tco/_fusion_shelf.py", "if position not in self._taken:", "if position in self._taken:"),
+            ("colmap_tco/fusion.py", "max_agreed_error > 0 and", "max_agreed_error >= 0 and"),
+            ("colmap_tco/fusion.py", "max_agreed_error > 0 and covered:", "max_agreed_error > 0:"),
+            ("colmap_tco/fusion_report.py", "kept[kept >= count] - count", "kept[kept >= count]"),
+            ("colmap_tco/_fusion_reference.py", 'valid - found - own.dropped.get("max_agreed_error", 0)',
+             "valid - found"),
+        )
+    ),
+    *_of(
+        "tco/linearise.py",
+        "poses",
+        ("_cross(x, in_source), in_world", "_cross(in_source, x), in_world"),
+        ("_cross(by_point, X), -in_world", "_cross(by_point, X), in_world"),
+        ("torch.cat([-over_z, (own +", "torch.cat([-over_z, (own -"),
+        ("zoom = -(in_source[:2] * x[:2]).sum(0) -", "zoom = -(in_source[:2] * x[:2]).sum(0) +"),
+        ("(offset @ in_world)", "(-offset @ in_world)"),
     ),
     *_of(
         "tco/polish.py",

@@ -10,9 +10,13 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
+from colmap_tco import _fusion_kernels as kernels
+from colmap_tco._fusion_gaps import Covered
 from colmap_tco.fusion import EmptyCloudError, FusionMaps, FusionView, fuse
 from colmap_tco.fusion_report import FusionReport
+from colmap_tco.pinhole import Pinhole
 from colmap_tco.ply import Cloud
+from colmap_tco.workers import Workers
 from tests.colmap_tco.test_fusion import (
     CONFIG,
     NORMAL,
@@ -301,3 +305,47 @@ def test_wrong_input_is_refused(own: list[FusionView], agreed: list[FusionView],
             fuse(own, CONFIG, agreed=others)
     with pytest.raises(ValueError, match="max_agreed_error must not be negative"):
         fuse(own, replace(CONFIG, max_agreed_error=-1.0), agreed=agreed)
+
+
+def marked(depths: list[float], focal: float, neighbours: tuple[tuple[int, ...], tuple[int, ...]]) -> Floats:
+    """What points at these depths, one above each fourth pixel, cover in a map of depth 4 with focal 100.
+
+    They are of another view in the same place, whose maps have this focal length.
+    """
+    camera = kernels.camera(np.array([100.0, 100.0, 24.0, 4.0]))
+    maps = Pinhole(48, 8, 100.0, 100.0, 24.0, 4.0)
+    views = [
+        FusionView(f"{i}.jpg", i, maps, np.eye(4)[:3], neighbours[i], lambda: FusionMaps(*3 * [np.zeros(1)]))
+        for i in range(2)
+    ]
+    covered = Covered(views, 50)
+    assert not covered
+    z = np.array(depths)
+    column = 4.0 * np.arange(len(z)) + 2.5
+    points = np.stack([(column - 24) / 100 * z, 0.5 / 100 * z, z], -1)
+    covered.add(0, points, kernels.camera(np.array([focal, focal, 24.0, 4.0])))
+    assert covered
+    packed = np.zeros((8, 48, 5), np.float32)
+    packed[..., 0] = 4.0
+    taken = np.zeros((8, 48), np.uint8)
+    covered.mark(1, packed, camera, 0.01, taken, Workers(1))
+    return taken
+
+
+def test_points_cover_the_pixels_that_show_them_and_none_behind_or_before() -> None:
+    taken = marked([4.0, 4.03, 4.05, 3.97, 3.9, 8.0, 2.0], 100.0, ((1,), ()))
+    covers = [bool(taken[4, 4 * i + 2]) for i in range(7)]
+    assert covers == [True, True, False, True, False, False, False]
+    # One pixel each: the next are a whole pixel off, and 0.75 are covered.
+    assert taken.sum() == 3
+
+
+@pytest.mark.parametrize(("focal", "pixels"), [(100.0, 1), (50.0, 9), (10.0, 9), (400.0, 1)])
+def test_points_of_coarse_maps_cover_more_and_fine_ones_their_pixel(focal: float, pixels: int) -> None:
+    assert marked([4.0], focal, ((1,), ())).sum() == pixels
+
+
+@pytest.mark.parametrize("neighbours", [((1,), ()), ((), (0,))])
+def test_it_is_enough_that_one_is_the_others_neighbour(neighbours: tuple[tuple[int, ...], ...]) -> None:
+    assert marked([4.0], 100.0, (neighbours[0], neighbours[1])).sum() == 1
+    assert marked([4.0], 100.0, ((), ())).sum() == 0

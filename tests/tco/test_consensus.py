@@ -285,8 +285,10 @@ def test_depths_that_are_none_stay_none_and_say_nothing(scene: Wall, missing: fl
     depth = scene.depth.clone()
     depth[2, 10:20, 10:20] = missing
     depth[0] *= 1.02
-    moved = together(scene, said(scene, depth))
+    found = agreed(said(scene, depth), scene_cameras(scene), scene.views, scene.priors, ConsensusConfig())
+    moved = found.prediction.depth
     torch.testing.assert_close(moved[2, 10:20, 10:20], depth[2, 10:20, 10:20], equal_nan=True)
+    assert bool(found.error[2, 10:20, 10:20].isinf().all()) and bool((found.error >= 0).all())
     there = torch.ones_like(depth, dtype=torch.bool)
     there[2, 10:20, 10:20] = False
     assert bool(torch.isfinite(moved[there]).all()) and bool((moved[there] > 0).all())
