@@ -295,6 +295,21 @@ def test_depths_that_are_none_stay_none_and_say_nothing(scene: Wall, missing: fl
     assert float(off(moved[0], scene.depth[0])[by_enough(scene, 0)].median()) < 1e-3
 
 
+def test_what_stands_for_no_depth_is_not_asked_about() -> None:
+    """A wall at about the depth 1, which a missing depth is while the views are asked."""
+    scene = wall(VIEWS)
+    cameras = scene_cameras(scene)
+    pose = cameras.world_from_cam.clone()
+    pose[:, :3, 3] /= 2
+    near = replace(scene, priors=replace(scene.priors, cameras=Cameras(pose, cameras.K)))
+    depth = scene.depth / 2
+    depth[3, 20:30, 20:40] = 0
+    found = agreed(said(near, depth), scene_cameras(near), near.views, near.priors, ConsensusConfig())
+    assert bool((found.prediction.depth[3, 20:30, 20:40] == 0).all())
+    assert bool(found.error[3, 20:30, 20:40].isinf().all())
+    assert bool(found.error[3, 22:28, 12:16].isfinite().all())
+
+
 def test_nothing_is_asked_where_cameras_are_uncertain(scene: Wall, caplog: pytest.LogCaptureFixture) -> None:
     wrong = scene.depth.clone()
     wrong[2] *= 1.08
