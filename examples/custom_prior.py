@@ -34,7 +34,7 @@ from tco.types import Cameras
 Floats = NDArray[np.floating]
 
 
-def plane_term(plane: Floats, weight: float = 1.0, reach: float = 0.02) -> ExtraTerm:
+def plane_term(plane: Floats, weight: float = 0.1, reach: float = 0.02) -> ExtraTerm:
     """The penalty for a plane (4,) in the chunk's frame, as ``Scene.chunk_plane`` gives it."""
     normal, offset = torch.tensor(plane[:3]).float(), float(plane[3])
 
