@@ -1,12 +1,13 @@
 """Rendered scenes unlike those that the embedded network is trained on, in the form of the shared real sets.
 
-    python -m benchmarks.rendered runs/rendered [--scenes hills knots walk]
+    python -m benchmarks.rendered runs/rendered [--scenes hills knots walk temple]
 
 Training scenes are made of boxes, spheres, cylinders and slabs by the tracer in ``training/``. These are
 triangle meshes (Open3D's Embree), with colours from a noise of their own: ``hills``, a displaced ground with
-standing stones seen from the air; ``knots``, thin curved bodies over a table; and ``walk``, the room of the
-demo, which training never sees. Each becomes a workspace with ``images/``, ``sparse/`` made by COLMAP, and
-``gt/`` as ``../shared/tools/score.py`` reads it; one unit of the scene is a metre.
+standing stones seen from the air; ``knots``, thin curved bodies over a table; ``walk``, the room of the demo,
+which training never sees; and ``temple``, columns under a clouded sky, which has no depth. Each becomes a
+workspace with ``images/``, ``sparse/`` made by COLMAP, and ``gt/`` as ``../shared/tools/score.py`` reads it;
+one unit of the scene is a metre.
 """
 
 from __future__ import annotations
@@ -112,12 +113,49 @@ def knots() -> tuple[list, list[Floats]]:
     return [*bodies, beads], [look_at(eye, np.array([0, 0.15, 0.35])) for eye in eyes]
 
 
+def temple() -> tuple[list, list[Floats]]:
+    """Columns on steps with a beam over them and a wall behind, from an arc at eye height: much is sky."""
+    import open3d as o3d
+
+    make = o3d.geometry.TriangleMesh
+    bodies = [
+        make.create_box(60, 60, 0.1).translate((-30, -30, -0.1)),
+        make.create_box(9, 5, 0.3).translate((-4.5, -2.5, 0)),
+        make.create_box(8, 4, 0.3).translate((-4, -2, 0.3)),
+        make.create_box(7.6, 0.8, 0.7).translate((-3.8, -1.8, 3.6)),
+        make.create_box(5, 0.4, 2.2).translate((-4, 1.4, 0.6)),
+    ]
+    for x in np.linspace(-3.4, 3.4, 6):
+        column = make.create_cylinder(0.3, 3.0, 32, 12)
+        points = np.asarray(column.vertices)
+        points[:, :2] *= 1 + 0.08 * np.cos(12 * np.arctan2(points[:, 1], points[:, 0]))[:, None]
+        bodies.append(column.translate((x, -1.4, 2.1)))
+    bodies.append(make.create_icosahedron(0.6).translate((2.6, -4.0, 0.55)))
+    turns = np.linspace(-0.5, 0.5, VIEWS)
+    eyes = [np.array([9 * np.sin(t), -9 * np.cos(t), 1.6 + 0.2 * np.sin(5 * t)]) for t in turns]
+    return bodies, [look_at(eye, np.array([0.5 * t, 0, 2.4])) for eye, t in zip(eyes, turns, strict=True)]
+
+
+def clouds(rays: Floats) -> Floats:
+    """Linear colours (N, 3) of a sky in directions (N, 3): blue, paler at the horizon, with clouds."""
+    up = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    blue = np.array([0.25, 0.45, 0.85]) + (1 - np.clip(up[:, 2:], 0, 1)) ** 3 * np.array([0.5, 0.4, 0.1])
+    cover = 1 / (1 + np.exp(-18 * (noise(up * np.array([3, 3, 7]), 5, 31) - 0.55)))
+    return blue + cover[:, None] * (0.95 - blue)
+
+
 def traced(
-    bodies: list, poses: list[Floats], scale: float, shape: tuple[int, int] = SHAPE, fine: int = 2
+    bodies: list,
+    poses: list[Floats],
+    scale: float,
+    shape: tuple[int, int] = SHAPE,
+    fine: int = 2,
+    sky: Callable[[Floats], Floats] = lambda rays: np.full(rays.shape, 0.8),
 ) -> Sample:
     """Pictures (h, w) of bodies, each of another material, from cameras world_from_cam, lit by sun and sky.
 
-    Colours are the mean of ``fine`` × ``fine`` rays a pixel, depths are those of its centre.
+    Where there is no body, ``sky`` tells the linear colours (N, 3) in directions (N, 3). Colours are the
+    mean of ``fine`` × ``fine`` rays a pixel, depths are those of its centre.
     """
     import open3d as o3d
 
@@ -139,7 +177,8 @@ def traced(
         hit = _cast(scene, eye, rays)
         seen = np.isfinite(hit["t_hit"])
         points = eye + np.where(seen, hit["t_hit"], 0)[:, None] * rays
-        color = np.full((len(rays), 3), 0.8)
+        color = np.empty((len(rays), 3))
+        color[~seen] = sky(rays[~seen])
         for body in range(len(bodies)):
             mine = seen & (hit["geometry_ids"] == body)
             color[mine] = painted(points[mine], scale, 20 + body)
@@ -163,6 +202,7 @@ SCENES: dict[str, Callable[[], Sample]] = {
     "hills": lambda: traced(*hills(), scale=2.0),
     "knots": lambda: traced(*knots(), scale=9.0),
     "walk": lambda: walk(seed=11, views=VIEWS, shape=SHAPE),
+    "temple": lambda: traced(*temple(), scale=1.5, sky=clouds),
 }
 
 

@@ -209,7 +209,8 @@ def load(path: Path, seed: int, shape: tuple[int, int]) -> tuple[Views, Priors, 
     if not len(tracks.xyz) or tracks.seen.sum(1).min() < 8:
         return None
     s = resized(s, shape)
-    s = Sample(s.images[..., rng.permutation(3)], s.depth, s.K, s.cam_from_world)
+    if rng.random() < 0.5:  # any colours; in the other half the sky is as it is
+        s = Sample(s.images[..., rng.permutation(3)], s.depth, s.K, s.cam_from_world)
     return assemble(jittered(s, rng), photographed(s.images, rng), tracks)
 
 

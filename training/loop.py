@@ -225,7 +225,7 @@ class Loop(ABC):
             if self.step % every == 0 or self.finished:
                 self.refresh()
                 if self.rank == 0 and rows:
-                    means = {k: float(np.mean([r[k] for r in rows])) for k in rows[0]}
+                    means = {k: float(np.nanmean([r[k] for r in rows])) for k in rows[0]}
                     self.log("train", means, (time.monotonic() - start) / len(rows))
                     self.save()
                 rows, start = [], time.monotonic()

@@ -21,9 +21,13 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from tco.backbones.sweep import Encoded, Stage, Sweep
+from tco.backbones.sweeping import FAR
 from tco.types import Priors, Views
 from training.dataset import load
 from training.loop import Loop, LoopConfig, arguments, launch
+
+FLOOR = FAR / 2
+"""Inverse depths below so many times the sweep's smallest are background: the farthest points' depth × 2."""
 
 Drawn = tuple[tuple[Views, Priors, Tensor], np.random.Generator]
 
@@ -69,21 +73,34 @@ def coarse_loss(stage: Stage, encoded: Encoded, truth: Tensor) -> Tensor:
     return ((entropy + 0.3 * off) * known).sum() / known.sum().clamp_min(1)
 
 
-def fine_loss(stage: Stage, truth: Tensor) -> Tensor:
-    """Laplace likelihood of the relative error and a clipped relative L1."""
+def with_sky(depth: Tensor, encoded: Encoded) -> tuple[Tensor, Tensor]:
+    """Depth (V, H, W) with the sky, where it is 0, and what is as far put at the end of the sweep.
+
+    The second (V, 1, 1) is the inverse depth ``FLOOR``, below which is the background.
+    """
+    end = 1 / encoded.lo.view(-1, 1, 1)
+    return torch.where(depth > 0, depth, end).minimum(end), FLOOR * encoded.lo.view(-1, 1, 1)
+
+
+def fine_loss(stage: Stage, truth: Tensor, floor: Tensor) -> Tensor:
+    """Laplace likelihood of the relative error and a clipped relative L1.
+
+    Errors of inverse depths below ``floor`` (V, 1, 1) are relative to that.
+    """
     known = truth > 0
-    error = (stage.inverse / truth.clamp_min(1e-6) - 1).abs()
+    error = (stage.inverse - truth).abs() / truth.maximum(floor)
     log_b = stage.log_error.clamp(math.log(3e-3), 0.0)
     likelihood = error.clamp_max(0.5) * (-log_b).exp() + log_b
     return ((likelihood + 8 * error.clamp_max(0.25)) * known).sum() / known.sum().clamp_min(1)
 
 
-def slope_loss(stage: Stage, truth: Tensor) -> Tensor:
+def slope_loss(stage: Stage, truth: Tensor, floor: Tensor) -> Tensor:
     """Mean absolute difference of the slopes of log-depth at spacings of 1, 2 and 4 pixels, clipped.
 
-    Flat surfaces stay flat and edges sharp: an offset common to neighbours costs nothing here.
+    Flat surfaces stay flat and edges sharp: an offset common to neighbours costs nothing here. What is
+    farther than ``floor`` (V, 1, 1) has no slope.
     """
-    known = truth > 0
+    known = truth > floor
     off = torch.where(known, stage.inverse.log() - truth.clamp_min(1e-6).log(), torch.zeros_like(truth))
     total = off.new_zeros(())
     for s in (1, 2, 4):
@@ -100,6 +117,7 @@ def losses(net: Sweep, sample: tuple, refined: list[int], sources: int) -> tuple
     views, priors, depth = sample
     encoded = net.encode(views, priors, sources)
     first = net.coarse(encoded, range(len(views)))
+    depth, floor = with_sky(depth, encoded)
     total = coarse_loss(first, encoded, pooled(depth, 4))
     world = first.detached().doubled()
     stage = first[torch.tensor(refined, device=depth.device)]
@@ -108,18 +126,21 @@ def losses(net: Sweep, sample: tuple, refined: list[int], sources: int) -> tuple
         stage = net.refine(k, encoded, refined, stage, world)
         last = k + 1 == len(net.config.spacing)
         truth = pooled(depth[refined], 1 if last else 2)
-        term = fine_loss(stage, truth) + 2 * slope_loss(stage, truth)
+        term = fine_loss(stage, truth, floor[refined]) + 2 * slope_loss(stage, truth, floor[refined])
         total = total + (1.0 if last else 0.5) * term
         if not last:
             inverse, error = world.inverse.clone(), world.log_error.clone()
             inverse[refined], error[refined] = stage.inverse.detach(), stage.log_error.detach()
             world = Stage(inverse, error)
-    known = truth > 0
-    off = (stage.inverse / truth.clamp_min(1e-6) - 1).abs()[known]
+    surface = truth > floor[refined]
+    off = (stage.inverse / truth - 1).abs()[surface]
     figures.update(
         fine=float(term.detach()),
         d2=float((off < 0.02).float().mean()),
         d5=float((off < 0.05).float().mean()),
+        sky=float((stage.inverse < floor[refined])[~surface].float().mean())
+        if (~surface).any()
+        else math.nan,
     )
     return total, figures
 
@@ -191,7 +212,7 @@ class Trainer(Loop):
             if sample is not None:
                 moved = tuple(x.to(self.device) for x in sample)
                 rows.append(losses(self.mean, moved, [0, 3], 5)[1])
-        return {k: float(np.mean([r[k] for r in rows])) for k in rows[0]}
+        return {k: float(np.nanmean([r[k] for r in rows])) for k in rows[0]}
 
 
 def trainer(config: TrainConfig, data: Sequence[Path], out: Path, device: str, rank: int) -> Trainer:

@@ -32,8 +32,13 @@ def relative_cameras(cameras: Cameras, views: Sequence[int], sources: Tensor, fa
     return torch.cat([A, b], -1)
 
 
+FAR = 20.0
+"""Where the sweep ends, in units of the depth of the farthest points. To cameras as far apart as it takes to
+triangulate those, what is there hardly differs from the sky."""
+
+
 def inverse_range(sparse: Sequence[SparseDepth], like: Tensor) -> tuple[Tensor, Tensor]:
-    """Smallest and largest inverse depth (V,) to sweep: the points' 1st percentile × 0.7 to the 99th × 2.
+    """Smallest and largest inverse depth (V,) of a sweep: the points' 1st percentile × 0.7 to 99th × ``FAR``.
 
     Raises:
         ValueError: a view has no sparse point.
@@ -43,7 +48,7 @@ def inverse_range(sparse: Sequence[SparseDepth], like: Tensor) -> tuple[Tensor, 
         if len(points) == 0:
             raise ValueError(f"view {i} has no sparse point, so its depth range is unknown")
         near, far = torch.quantile(points.depth.float(), points.depth.new_tensor([0.01, 0.99]).float())
-        lo.append(1 / (2 * far))
+        lo.append(1 / (FAR * far))
         hi.append(1 / (0.7 * near))
     return torch.stack(lo).to(like), torch.stack(hi).to(like)
 

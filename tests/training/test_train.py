@@ -16,7 +16,20 @@ from tco.backbones.sweep import Encoded, Stage, Sweep
 from tco.backbones.weights import load_sweep
 from training import train
 from training.dataset import load, write
-from training.train import TrainConfig, Trainer, coarse_loss, fine_loss, losses, pooled, slope_loss
+from training.train import (
+    FLOOR,
+    TrainConfig,
+    Trainer,
+    coarse_loss,
+    fine_loss,
+    losses,
+    pooled,
+    slope_loss,
+    with_sky,
+)
+
+NOWHERE = torch.zeros(1, 1, 1)
+"""A background that nothing belongs to."""
 
 TINY = SweepConfig(
     planes=16, groups=(4, 2), coarse=16, fine=8, context=8, volume=6, tokens=32, heads=2, blocks=1, hidden=16
@@ -83,7 +96,10 @@ def test_pixels_without_truth_do_not_count() -> None:
     torch.testing.assert_close(
         coarse_loss(stage, encoded, truth), coarse_loss(alone, encoded, truth[..., :1])
     )
-    both = [fine_loss(Stage(s.inverse, s.log_error), t) for s, t in ((stage, truth), (alone, truth[..., :1]))]
+    both = [
+        fine_loss(Stage(s.inverse, s.log_error), t, NOWHERE)
+        for s, t in ((stage, truth), (alone, truth[..., :1]))
+    ]
     torch.testing.assert_close(both[0], both[1])
 
 
@@ -100,13 +116,15 @@ def test_what_lies_outside_the_sweep_belongs_to_its_end(truth: float, end: int) 
 def test_a_common_offset_has_no_slope_and_a_tilt_has_its_own() -> None:
     truth = 0.3 + 0.2 * torch.rand(1, 12, 16, generator=torch.Generator().manual_seed(2))
     zero = torch.zeros_like(truth)
-    assert float(slope_loss(Stage(truth * 1.03, zero), truth)) == pytest.approx(0, abs=1e-5)
+    assert float(slope_loss(Stage(truth * 1.03, zero), truth, NOWHERE)) == pytest.approx(0, abs=1e-5)
     tilted = truth * torch.exp(0.01 * torch.arange(16.0))
-    assert float(slope_loss(Stage(tilted, zero), truth)) == pytest.approx(0.01 + 0.02 + 0.04, rel=1e-3)
+    assert float(slope_loss(Stage(tilted, zero), truth, NOWHERE)) == pytest.approx(
+        0.01 + 0.02 + 0.04, rel=1e-3
+    )
     holes = truth.clone()
     holes[:, ::2] = 0
     holes[:, :, ::2] = 0  # no two neighbours at spacing 1; those at 2 and 4 remain
-    assert float(slope_loss(Stage(tilted, zero), holes)) == pytest.approx(0.02 + 0.04, rel=1e-3)
+    assert float(slope_loss(Stage(tilted, zero), holes, NOWHERE)) == pytest.approx(0.02 + 0.04, rel=1e-3)
 
 
 def test_the_fine_loss_is_lowest_where_the_expected_error_is_the_true_one() -> None:
@@ -114,10 +132,31 @@ def test_the_fine_loss_is_lowest_where_the_expected_error_is_the_true_one() -> N
     truth = torch.full((1, 1, 1), 0.5)
     inverse = truth * 1.04
     scales = torch.tensor([0.01, 0.02, 0.04, 0.08, 0.16])
-    values = [float(fine_loss(Stage(inverse, scale.log().expand(1, 1, 1)), truth)) for scale in scales]
+    values = [
+        float(fine_loss(Stage(inverse, scale.log().expand(1, 1, 1)), truth, NOWHERE)) for scale in scales
+    ]
     assert min(values) == values[2] == pytest.approx(1 + math.log(0.04) + 8 * 0.04, abs=1e-4)
-    exact = float(fine_loss(Stage(truth, torch.full((1, 1, 1), math.log(3e-3))), truth))
+    exact = float(fine_loss(Stage(truth, torch.full((1, 1, 1), math.log(3e-3))), truth, NOWHERE))
     assert exact == pytest.approx(math.log(3e-3), abs=1e-5)
+
+
+def test_the_sky_is_at_the_end_of_the_sweep() -> None:
+    """0.2 is the sweep's smallest inverse depth: what is farther, and the sky, is there."""
+    _, encoded = planes_stage(torch.zeros(1, 6, 1, 3), torch.zeros(1, 1, 3))
+    depth, floor = with_sky(torch.tensor([[[2.5, 0.0, 9.0]]]), encoded)
+    torch.testing.assert_close(depth, torch.tensor([[[2.5, 5.0, 5.0]]]))
+    assert float(floor) == pytest.approx(0.2 * FLOOR)
+
+
+def test_in_the_background_errors_are_relative_to_where_it_begins() -> None:
+    """At half of the background's inverse depth, the same difference is half of what it is relatively."""
+    truth, log_b = torch.full((1, 1, 1), 0.1), torch.zeros(1, 1, 1)
+    stage = Stage(truth + 0.01, log_b)
+    assert float(fine_loss(stage, truth, NOWHERE)) == pytest.approx(0.1 + 8 * 0.1, rel=1e-4)
+    assert float(fine_loss(stage, truth, NOWHERE + 0.2)) == pytest.approx(0.05 + 8 * 0.05, rel=1e-4)
+    tilted = Stage(truth.expand(1, 8, 8) * torch.exp(0.01 * torch.arange(8.0)), log_b.expand(1, 8, 8))
+    assert float(slope_loss(tilted, truth.expand(1, 8, 8), NOWHERE)) > 0.05
+    assert float(slope_loss(tilted, truth.expand(1, 8, 8), NOWHERE + 0.2)) == 0
 
 
 def test_a_few_steps_lower_the_loss_of_a_sample(data: Path) -> None:
@@ -134,7 +173,7 @@ def test_a_few_steps_lower_the_loss_of_a_sample(data: Path) -> None:
         optimiser.step()
         seen.append(float(loss.detach()))
     assert seen[-1] < 0.9 * seen[0]
-    assert figures.keys() == {"coarse", "fine", "d2", "d5"}
+    assert figures.keys() == {"coarse", "fine", "d2", "d5", "sky"}
     assert all(p.grad is not None and bool(torch.isfinite(p.grad).all()) for p in net.parameters())
 
 
