@@ -65,7 +65,6 @@ def variants(decoder: nn.Module, plain: TCOConfig) -> Iterator[tuple[str, TCOCon
     yield "all targets", replace(plain, targets=1_000)
     yield "sources by overlap", ablation(source_order="overlap")
     yield "sources uniform", ablation(source_order="uniform")
-    yield "lazy refresh", replace(plain, lazy_refresh=True)
     yield "no refresh", replace(plain, refresh=10_000)
     yield "stop by hidden points", replace(plain, stop_after=plain.steps // 3)
 

@@ -18,8 +18,8 @@ from torch import Tensor, nn
 
 from tco.backbones.base import Backbone
 from tco.config import knob
-from tco.penalties import focal, inverse_depth_error, rotation, rotation_angle, translation
-from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
+from tco.penalties import held, inverse_depth_error, rotation_angle
+from tco.types import Cameras, HeldCameras, Prediction, Priors, SparseDepth, Views
 
 logger = logging.getLogger(__name__)
 
@@ -37,6 +37,25 @@ class CameraPenalties:
     rotation: float = knob(1.0, "weight of the mean angle to the given rotations, radians")
     translation: float = knob(2.0, "weight of the L1 of normalised centres")
     focal: float = knob(0.01, "weight of the L1 of focal lengths, pixels")
+    by_uncertainty: bool = knob(
+        False,
+        "hold these cameras in standard deviations of COLMAP's, under a robust kernel, all with the weight "
+        "of rotations; for cameras that are not exact",
+    )
+
+    def known(self, priors: Priors) -> HeldCameras:
+        """The cameras among the priors as what a network's own are held to.
+
+        Raises:
+            ValueError: standard deviations are wanted, and one is not among the priors.
+        """
+        assert priors.cameras is not None
+        if not self.by_uncertainty:
+            return HeldCameras(priors.cameras, self.rotation, self.translation, self.focal)
+        sigmas = priors.rotation_sigma, priors.centre_sigma, priors.focal_sigma
+        if any(sigma is None for sigma in sigmas):
+            raise ValueError("by_uncertainty is set, and the cameras have no standard deviations")
+        return HeldCameras(priors.cameras, self.rotation, self.rotation, self.rotation, *sigmas)
 
 
 @dataclass(frozen=True)
@@ -204,7 +223,7 @@ class KnownCameras(nn.Module):
         assert given is not None
         depth = predicted.depth * self._scales(predicted, encoded)[:, None, None]
         if torch.is_grad_enabled() and depth.requires_grad:
-            depth = _Carry.apply(depth, self._penalty(predicted.cameras, given))
+            depth = _Carry.apply(depth, self._penalty(predicted.cameras, encoded.priors))
         else:
             self._compare(predicted.cameras, given)
         return Prediction(depth, predicted.confidence, given, predicted.views)
@@ -227,14 +246,17 @@ class KnownCameras(nn.Module):
         poses = predicted.cameras.world_from_cam.detach()
         return align_cameras(poses, given.world_from_cam).scale.to(predicted.depth)
 
-    def _penalty(self, predicted: Cameras, given: Cameras) -> Tensor:
-        """Weighted sum of the penalties, whose values go into the history."""
-        w, (ours, theirs) = self.penalties, (predicted.world_from_cam, given.world_from_cam)
-        terms = {"focal": (w.focal, focal(predicted.K, given.K))}
+    def _penalty(self, predicted: Cameras, priors: Priors) -> Tensor:
+        """Weighted sum of the penalties, whose values go into the history.
+
+        Of one view there is no relative pose, and of centres in one place no scale: these parts are left out.
+        """
+        known = self.penalties.known(priors)
+        ours, theirs = predicted.world_from_cam, known.cameras.world_from_cam
+        names = ["focal"]
         if len(ours) > 1:
-            terms["rotation"] = (w.rotation, rotation(ours, theirs))
-            if _spread(ours) and _spread(theirs):
-                terms["translation"] = (w.translation, translation(ours, theirs))
+            names += ["rotation", "translation"] if _spread(ours) and _spread(theirs) else ["rotation"]
+        terms = {name: (getattr(known, name), held(name, predicted, known)) for name in names}
         self.history.append({name: float(value.detach()) for name, (_, value) in terms.items()})
         return torch.stack([weight * value for weight, value in terms.values()]).sum()
 

@@ -2,36 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 
 from tco.types import Prediction
 
 
-class Freshness:
-    """Which views' depths must be computed anew.
-
-    All of them every ``every`` steps; or, if ``lazy``, in each step those of the views it needs that are
-    as old as that.
-    """
-
-    def __init__(self, views: int, every: int, lazy: bool) -> None:
-        self.made, self.every, self.lazy = [0] * views, every, lazy
-
-    def due(self, number: int) -> bool:
-        """Whether a step is one in which depths are computed anew, or might be."""
-        return number > 0 and number % self.every == 0
-
-    def stale(self, number: int, needed: Iterable[int]) -> list[int]:
-        """Views to be computed before a step that needs some of them."""
-        if self.lazy:
-            return sorted(view for view in set(needed) if number - self.made[view] >= self.every)
-        return list(range(len(self.made))) if self.due(number) else []
-
-    def renew(self, views: Iterable[int], number: int) -> None:
-        """Record that the depths of some views were computed before a step."""
-        for view in views:
-            self.made[view] = number
+def due(number: int, every: int) -> bool:
+    """Whether the depths of all views are computed anew before a step: every few of them, not at first."""
+    return number > 0 and number % every == 0
 
 
 def detached(prediction: Prediction) -> Prediction:

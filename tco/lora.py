@@ -56,6 +56,11 @@ def matches(name: str, pattern: str) -> bool:
     return fnmatchcase(name, pattern) or fnmatchcase(name, f"*.{pattern}")
 
 
+def fits(module: nn.Module, pattern: str) -> bool:
+    """Whether a pattern fits any layer of ``module`` that an adapter can be put on."""
+    return any(isinstance(m, _KINDS) and matches(name, pattern) for name, m in module.named_modules())
+
+
 def select(module: nn.Module, patterns: Iterable[str]) -> dict[str, Layer]:
     """The layers of ``module`` that an adapter can be put on and whose names fit one of the patterns.
 

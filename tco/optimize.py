@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -14,10 +14,10 @@ from torch import Tensor
 
 from tco.adam import Adam
 from tco.backbones.base import Backbone
-from tco.context import Freshness, detached, merged
+from tco.context import detached, due, merged
 from tco.corrections import CameraCorrections
 from tco.free import FreePixels
-from tco.lora import LoRAConfig, adapted
+from tco.lora import LoRAConfig, adapted, fits
 from tco.options import TCOConfig
 from tco.penalties import sparse_depth
 from tco.polish import polish, too_uncertain
@@ -85,7 +85,8 @@ def optimize(
         report: called after every step with its number and its terms.
         watched: points of each view that nothing is fitted to. The history then holds ``held_out``: the mean
             over a step's sources of the median relative error at their points, as they are decoded in the
-            step, with a part of their input points hidden, or refined in it. It steers nothing.
+            step, with a part of their input points hidden, or refined in it. It steers nothing, but for
+            ``stop_after``, which stops the steps on the network when it falls no more.
         extra: penalties of the caller's own (:class:`tco.terms.ExtraTerm`), lowered with the others, in the
             steps on the network and in those on the depths.
 
@@ -121,7 +122,7 @@ def optimize(
             if report is not None:
                 report(step, figures)
             if run.stopped:
-                logger.info("stopped after %d steps: the error at hidden points falls no more", step + 1)
+                logger.info("stopped after %d steps: the error at unseen points falls no more", step + 1)
                 break
         adapted_outcome = run.outcome()
     return run.polished(adapted_outcome, report)
@@ -145,7 +146,6 @@ class _Run:
         self.corrections = CameraCorrections(priors) if movable else None
         a = config.ablation
         self.free = FreePixels(context.depth, a.free_depth, a.free_surfels)
-        self.freshness = Freshness(len(views), config.refresh, config.lazy_refresh)
         self.sources = Sources(a.source_order, self.terms.overlap, generator, views.helpers)
         patience = config.stop_after * config.sources
         self.stagnation = Stagnation(len(views), patience) if patience else None
@@ -157,8 +157,15 @@ class _Run:
     def adapters(self) -> AbstractContextManager[list[torch.nn.Parameter]]:
         """Low-rank adapters on the decoder, drawn from this run's generator."""
         c = self.config
-        lora = LoRAConfig(c.lora_rank, c.lora_alpha, c.lora_targets, c.ablation.unfrozen)
+        lora = LoRAConfig(c.lora_rank, c.lora_alpha, self._targets(), c.ablation.unfrozen)
         return adapted(self.backbone.decoder(), lora, self.generator)
+
+    def _targets(self) -> tuple[str, ...]:
+        """Patterns of the layers to adapt: as given; of the default those that fit any."""
+        patterns = self.config.lora_targets
+        if patterns != TCOConfig().lora_targets:
+            return patterns
+        return tuple(p for p in patterns if fits(self.backbone.decoder(), p))
 
     def prepare(self, parameters: Sequence[torch.nn.Parameter]) -> None:
         """Optimiser over the adapters and the camera corrections; remember the start as the best state."""
@@ -237,11 +244,13 @@ class _Run:
         shown = {source: self._hide(source) for source in sources}
         count, overlap = self.config.targets, self.terms.overlap
         targets = {source: draw_targets(overlap, source, count, self.generator) for source in sources}
+        if self.config.ablation.published_objective and count >= len(self.views):
+            targets = {source: list(range(len(self.views))) for source in sources}  # the source among them
         if not weights.keys() & COMPATIBILITY:
             targets = {source: [] for source in sources}
         prediction, parts = self.context, []
         if weights.keys() - {"cameras"}:
-            self._refresh(number, {view for chosen in targets.values() for view in chosen})
+            self._refresh(number)
             prediction = self._predict(shown)
         cameras = self.cameras(prediction)
         if weights.keys() - {"cameras"}:
@@ -257,16 +266,24 @@ class _Run:
         return terms
 
     def _watch(self, source: int, shown: Tensor, prediction: Prediction) -> dict[str, Tensor]:
-        """``held_out``: the error at watched points; ``hidden``: at hidden ones, if it tells when to stop."""
+        """``held_out``: the error at watched points; and see whether it is time to stop.
+
+        Where no points are watched, those that the network was not shown tell that, as ``hidden``: they are
+        in the loss, and so know less of it.
+        """
         depth = prediction.depth[prediction.views.index(source)].detach()
-        found = {}
-        if self.watched and len(self.watched[source]):
-            found["held_out"] = errors_at(depth, self.watched[source]).abs().median()
-        if self.stagnation is None or bool(shown.all()):
+        found, points = {}, self.watched[source] if self.watched else None
+        if points is not None and len(points):
+            found["held_out"] = errors_at(depth, points).abs().median()
+        if self.stagnation is None:
             return found
-        hidden = sparse_depth(depth, self.terms.sparse[source][~shown])
-        self.stopped |= self.stagnation.add(source, float(hidden))
-        return {**found, "hidden": hidden}
+        if points is None:
+            points = self.terms.sparse[source][~shown]
+            if len(points):
+                found["hidden"] = sparse_depth(depth, points)
+        if len(points):
+            self.stopped |= self.stagnation.add(source, float(sparse_depth(depth, points)))
+        return found
 
     def _hide(self, source: int) -> Tensor:
         """Which points of a view (N,) the network is shown in this step."""
@@ -292,13 +309,11 @@ class _Run:
         return self.free.apply_to(self.backbone.decode(encoded, views, context))
 
     @torch.no_grad()
-    def _refresh(self, number: int, needed: Iterable[int]) -> None:
+    def _refresh(self, number: int) -> None:
         """Compute the context anew where it is too old, with corrected cameras if they went far."""
-        anew = self.freshness.due(number) and self._reencode()
-        stale = list(range(len(self.views))) if anew else self.freshness.stale(number, needed)
-        if stale:
-            self.context = merged(self.context, self._decode(self.encoded, stale, self.context))
-            self.freshness.renew(stale, number)
+        if due(number, self.config.refresh):
+            self._reencode()
+            self.context = merged(self.context, self._decode(self.encoded, context=self.context))
 
     @torch.no_grad()
     def _reencode(self) -> bool:

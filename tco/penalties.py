@@ -6,6 +6,7 @@ both are expressed in their first view before they are compared. A prior without
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,7 +15,7 @@ from torch.nn import functional as F
 
 from tco.config import knob
 from tco.geometry import invert, sample, scale_shift
-from tco.types import SparseDepth
+from tco.types import Cameras, HeldCameras, SparseDepth
 
 
 def in_first_view(world_from_cam: Tensor) -> Tensor:
@@ -163,7 +164,28 @@ def _focals(K: Tensor) -> Tensor:
     return torch.stack([K[..., 0, 0], K[..., 1, 1]], -1)
 
 
-def depth(predicted: Tensor, prior: Tensor, mask: Tensor) -> Tensor:
+def held(name: str, ours: Cameras, known: HeldCameras, published: bool = False) -> Tensor:
+    """Penalty (scalar) on a part of the cameras that a network predicts: rotation, translation or focal.
+
+    In standard deviations where ``known`` has them, else the paper's, or, ``published``, of the focal lengths
+    that of the published code. Errors are those of the parts' functions.
+    """
+    sigma, kernel = known.sigma(name), known.kernel
+    if name == "focal":
+        K = ours.K, known.cameras.K
+        if sigma is not None:
+            return focal_uncertain(*K, sigma, kernel)
+        return intrinsics_reference(*K) if published else focal(*K)
+    poses = ours.world_from_cam, known.cameras.world_from_cam
+    if sigma is not None:
+        uncertain = rotation_uncertain if name == "rotation" else translation_uncertain
+        return uncertain(*poses, sigma, kernel)
+    return rotation(*poses) if name == "rotation" else translation(*poses)
+
+
+def depth(
+    predicted: Tensor, prior: Tensor, mask: Tensor, counted: Sequence[int] | slice = slice(None)
+) -> Tensor:
     """Mean L1 over the mask after one least-squares scale and shift for all views: the paper's term.
 
     Differentiable also through the alignment.
@@ -172,12 +194,13 @@ def depth(predicted: Tensor, prior: Tensor, mask: Tensor) -> Tensor:
         predicted: (V, H, W).
         prior: (V, H, W), in any unit.
         mask: (V, H, W) bool, where the prior is known.
+        counted: the views whose pixels the mean is over; the alignment is of all.
 
     Raises:
         ValueError: fewer than two masked pixels, or a constant predicted depth.
     """
     scale, shift = scale_shift(predicted, prior, mask)
-    return (scale * predicted + shift - prior)[mask].abs().mean()
+    return (scale * predicted + shift - prior)[counted][mask[counted]].abs().mean()
 
 
 def depth_uncertain(

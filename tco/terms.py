@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -49,9 +49,9 @@ class ExtraTerm:
 
 COMPATIBILITY = frozenset({"photometric", "geometric", "warped", "consistency"})
 """Terms that compare a view with others."""
-HELD = {"rotation": penalties.rotation, "translation": penalties.translation, "focal": penalties.focal}
+HELD = ("rotation", "translation", "focal")
 """Terms that hold the cameras that a network predicts."""
-OWN = COMPATIBILITY | HELD.keys() | {"smoothness", "sparse", "depth", "cameras", "loss", "hidden", "held_out"}
+OWN = COMPATIBILITY | set(HELD) | {"smoothness", "sparse", "depth", "cameras", "loss", "hidden", "held_out"}
 """Names that the history has already."""
 
 
@@ -78,24 +78,21 @@ class Terms:
         self.held = priors.held
         if self.held is not None and self.given is not None:
             raise ValueError("cameras are given, so that there are none of the network's own to be held")
-        if config.depth_weight > 0 and priors.depth is None:
+        if config.depth_weight > 0:
+            self._check_depth()
+        if self.given is not None and config.sparse_weight > 0 and priors.sparse is None:
+            raise ValueError("sparse_weight is set and there are no sparse points among the priors")
+        self.sparse = priors.sparse or (_no_points(views.images),) * len(views)
+        alike = torch.ones(len(views), len(views)).fill_diagonal_(0)
+        self.overlap = alike if priors.overlap is None else priors.overlap
+        self.objective, self.surfels = comparison(config)
+
+    def _check_depth(self) -> None:
+        """Raise a ValueError if there is no dense depth."""
+        if self.depth is None:
             raise ValueError("depth_weight is set and there is no dense depth among the priors")
-        if self.given is None:
-            # Poses are wanted: the network's own are used, and there may be nothing but depth to go by.
-            self.sparse = priors.sparse or (_no_points(views.images),) * len(views)
-            alike = torch.ones(len(views), len(views)).fill_diagonal_(0)
-            self.overlap = alike if priors.overlap is None else priors.overlap
-        elif priors.sparse is None or priors.overlap is None:
-            raise ValueError("optimisation needs cameras, overlap and sparse points as priors")
-        else:
-            self.sparse, self.overlap = priors.sparse, priors.overlap
-        self.objective = ObjectiveConfig(
-            occlusion_tolerance=config.occlusion_tolerance,
-            exposure=config.exposure,
-            structure=config.structure,
-        )
-        a = config.ablation
-        self.surfels = SurfelConfig(a.radius_factor, confident_opacity=a.confident_opacity)
+        if int(((self.depth > 0) & self.views.valid).sum()) < 2:
+            raise ValueError("depth_weight is set and the dense depth is empty: all of it is 0 or masked out")
 
     def weights(self, number: int, movable: bool) -> dict[str, float]:
         """The weight of each term in a step; a term that is not here is not computed.
@@ -116,7 +113,8 @@ class Terms:
             **{term.name: term.weight for term in self.extra},
         }
         if self.held is not None:
-            every |= {name: getattr(self.held, name) for name in HELD}
+            alone = len(self.views) < 2  # which has no relative pose
+            every |= {name: getattr(self.held, name) for name in (HELD[2:] if alone else HELD)}
         return {name: weight for name, weight in every.items() if weight > 0}
 
     def of_source(
@@ -129,7 +127,7 @@ class Terms:
             source: index of the view, one of ``prediction.views``.
             targets: views that it is compared with; none: it is compared with none.
             prediction: differentiable.
-            context: prediction for all views, which is not.
+            context: prediction for all views, which is not. If ``prediction`` is of all views, it counts.
             cameras: of all views, as they are believed now.
             weights: which terms are wanted.
             adjust: changes of the surfels.
@@ -139,7 +137,7 @@ class Terms:
         if "sparse" in weights and len(self.sparse[source]):
             terms["sparse"] = penalties.sparse_depth(depth, self.sparse[source])
         if "depth" in weights:
-            terms |= self._depth(prediction)
+            terms |= self._depth(prediction, context)
         for term in self.extra:
             value = term.penalty(source, depth, cameras) if term.name in weights else None
             if value is not None:
@@ -153,29 +151,33 @@ class Terms:
             logger.warning("%s: no compatibility in this step: %s", self.views.names[source], error)
         return terms
 
-    def _depth(self, prediction: Prediction) -> dict[str, Tensor]:
-        """Penalty of the dense prior on the views that were predicted.
+    def _depth(self, prediction: Prediction, context: Prediction) -> dict[str, Tensor]:
+        """Penalty of the dense prior on the views that were predicted; none where it says nothing of them.
 
-        In standard deviations where these are known, else after one common scale and shift.
+        In standard deviations where these are known, else after one scale and shift of all views' depths.
         """
         assert self.depth is not None
         chosen = list(prediction.views)
-        mask = (self.depth[chosen] > 0) & self.views.valid[chosen]
-        if int(mask.sum()) < 2:
+        mask = (self.depth > 0) & self.views.valid
+        if not bool(mask[chosen].any()):
             return {}
-        given = prediction.depth, self.depth[chosen], mask
         if self.depth_sigma is not None:
-            return {"depth": penalties.depth_uncertain(*given, self.depth_sigma[chosen])}
-        return {"depth": penalties.depth(*given)}
+            given = prediction.depth, self.depth[chosen], mask[chosen], self.depth_sigma[chosen]
+            return {"depth": penalties.depth_uncertain(*given)}
+        at = torch.as_tensor(chosen, device=mask.device)
+        every = context.depth.index_copy(0, at, prediction.depth)
+        if self.config.ablation.published_objective:
+            sure = context.confidence.index_copy(0, at, prediction.confidence)
+            return {"depth": penalties.depth_reference(every, self.depth, mask, sure, 0.5)}
+        return {"depth": penalties.depth(every, self.depth, mask, chosen)}
 
     def _held(self, ours: Cameras, weights: Mapping[str, float]) -> dict[str, Tensor]:
-        """Penalties on the network's own cameras (arXiv 2604.03878, section 3.2.2)."""
+        """Penalties on the network's own cameras (arXiv 2604.03878, section 3.2.2), or by uncertainty."""
         if self.held is None:
             return {}
-        theirs = self.held.cameras
-        pairs = {"focal": (ours.K, theirs.K)}
-        pairs["rotation"] = pairs["translation"] = (ours.world_from_cam, theirs.world_from_cam)
-        return {name: HELD[name](*pairs[name]) for name in HELD if name in weights}
+        published = self.config.ablation.published_objective
+        names = [name for name in HELD if name in weights]
+        return {name: penalties.held(name, ours, self.held, published) for name in names}
 
     def _compatibility(
         self, source: int, targets: list[int], prediction: Prediction, context: Prediction,
@@ -183,7 +185,8 @@ class Terms:
     ) -> dict[str, Tensor]:  # fmt: skip
         """Compatibility of one source with its targets, in colour and in depth."""
         terms, depth = {}, prediction.depth[prediction.views.index(source)]
-        there = context.depth[targets], self.views.valid[targets], self.objective
+        known = prediction if len(prediction.views) == len(self.views) else context
+        there = known.depth[targets], self.views.valid[targets], self.objective
         if weights.keys() & {"photometric", "geometric"}:
             surfels = self._surfels(source, prediction, cameras, adjust)
         if "photometric" in weights:
@@ -223,6 +226,22 @@ class Terms:
         pose, given = cameras.world_from_cam, self.given.world_from_cam
         angle, centres = penalties.rotation(pose, given), penalties.translation(pose, given)
         return angle + 2 * centres + 0.01 * penalties.focal(cameras.K, self.given.K)
+
+
+def comparison(config: TCOConfig) -> tuple[ObjectiveConfig, SurfelConfig]:
+    """How surfels are made and compared, by the settings of an optimisation."""
+    a = config.ablation
+    if a.published_objective:
+        engine = "cpu" if a.renderer == "surface" else a.renderer
+        surfels = SurfelConfig(a.radius_factor, pixel_centre=0.0, confident_opacity=a.confident_opacity)
+        return replace(ObjectiveConfig.reference(), renderer=engine), surfels
+    objective = ObjectiveConfig(
+        occlusion_tolerance=config.occlusion_tolerance,
+        exposure=config.exposure,
+        structure=config.structure,
+        renderer=a.renderer,
+    )
+    return objective, SurfelConfig(a.radius_factor, confident_opacity=a.confident_opacity)
 
 
 def errors_at(depth: Tensor, points: SparseDepth) -> Tensor:

@@ -130,12 +130,30 @@ class HeldCameras(_Movable):
         rotation: weight of the mean angle between rotations relative to the first view, radians.
         translation: weight of the mean L1 of centres relative to the first view, normalised by distance.
         focal: weight of the mean L1 of focal lengths, pixels.
+        rotation_sigma: (V,) standard deviations of the rotations about each axis, radians; if they are given,
+            errors are measured in them, under a robust kernel. The weights are then of that.
+        translation_sigma: (V,) the same of the centres along each axis, in the unit of ``cameras``.
+        focal_sigma: (V,) the same of the relative focal lengths.
+        kernel: of errors beyond two standard deviations: quadratic, huber or cauchy.
     """
 
     cameras: Cameras
     rotation: float = 1.0
     translation: float = 2.0
     focal: float = 0.01
+    rotation_sigma: Tensor | None = None
+    translation_sigma: Tensor | None = None
+    focal_sigma: Tensor | None = None
+    kernel: str = "huber"
+
+    def sigma(self, name: str) -> Tensor | None:
+        """Standard deviations of a part, ``rotation``, ``translation`` or ``focal``, if they are known."""
+        parts = {
+            "rotation": self.rotation_sigma,
+            "translation": self.translation_sigma,
+            "focal": self.focal_sigma,
+        }
+        return parts[name]
 
 
 @dataclass(frozen=True)
@@ -147,8 +165,8 @@ class Priors(_Movable):
         sparse: one :class:`SparseDepth` a view.
         depth: (V, H, W) dense depth, 0 where there is none.
         overlap: (V, V) how much two views share (number of common tracks); the diagonal is 0.
-        rotation_sigma: (V,) standard deviation of the pose prior's rotation, radians.
-        centre_sigma: (V,) standard deviation of the camera centre, in units of length.
+        rotation_sigma: (V,) standard deviation of the pose prior's rotation about each axis, radians.
+        centre_sigma: (V,) standard deviation of the camera centre along each axis, in units of length.
         focal_sigma: (V,) standard deviation of the relative focal length.
         depth_sigma: (V, H, W) standard deviation of the relative error of the dense depth, which then is in
             the unit of the cameras; None: not known, and the depth is of any scale and shift.

@@ -4,23 +4,12 @@ from __future__ import annotations
 
 import torch
 
-from tco.context import Freshness, detached, merged
+from tco.context import detached, due, merged
 from tco.types import Cameras, Prediction
 
 
-def test_all_views_are_due_every_few_steps() -> None:
-    fresh = Freshness(3, every=4, lazy=False)
-    assert [step for step in range(13) if fresh.stale(step, {0})] == [4, 8, 12]
-    assert fresh.stale(8, set()) == [0, 1, 2]
-
-
-def test_lazily_a_view_is_due_when_it_is_needed_and_old() -> None:
-    fresh = Freshness(3, every=4, lazy=True)
-    assert fresh.stale(3, {0, 1}) == []
-    assert fresh.stale(5, {2, 1}) == [1, 2]
-    fresh.renew([1, 2], 5)
-    assert fresh.stale(8, {0, 1, 2}) == [0]
-    assert fresh.stale(9, {1}) == [1]
+def test_depths_are_due_every_few_steps_and_not_at_first() -> None:
+    assert [step for step in range(13) if due(step, 4)] == [4, 8, 12]
 
 
 def prediction(depth: float, views: tuple[int, ...]) -> Prediction:

@@ -294,10 +294,21 @@ def test_a_missing_prior_is_an_error(network: Sweep, scene: Scene, name: str) ->
         optimize(network, views, replace(priors, **{name: None}), QUICK)
 
 
-def test_a_missing_overlap_is_an_error_for_any_backbone(scene: Scene) -> None:
+def test_without_an_overlap_all_views_are_compared(scene: Scene) -> None:
     views, priors, _ = scene
-    with pytest.raises(ValueError, match="optimisation needs cameras, overlap and sparse points"):
-        optimize(Small(), views, replace(priors, overlap=None), SMALL)
+    everything = torch.ones(len(views), len(views)).fill_diagonal_(0)
+    results = [optimize(Small(), views, replace(priors, overlap=o), SMALL) for o in (None, everything)]
+    assert results[0].history == results[1].history
+
+
+def test_the_steps_end_when_held_out_points_improve_no_more(scene: Scene) -> None:
+    """With a rate of next to nothing nothing improves: each view is measured once, then the patience ends."""
+    views, priors, _ = scene
+    assert priors.sparse is not None
+    still = replace(SMALL, steps=40, rate=1e-12, camera_rate=0, stop_after=3, point_dropout=0.0)
+    outcome = optimize(Small(), views, priors, still, watched=priors.sparse)
+    assert len(outcome.history) == len(views) + 3
+    assert all("hidden" not in step for step in outcome.history)
 
 
 def test_every_view_is_a_source_once_before_any_is_again(scene: Scene) -> None:
@@ -462,7 +473,6 @@ def test_errors_at_points_are_those_of_the_pixels_they_fall_into() -> None:
         {"refresh": 0},
         {"point_dropout": 1.0},
         {"point_dropout": -0.1},
-        {"stop_after": 5, "point_dropout": 0.0},
     ],
 )
 def test_settings_out_of_range_are_refused(wrong: dict[str, float]) -> None:

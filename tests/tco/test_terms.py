@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
 
+from tco import penalties
 from tco.backbones.base import Backbone
-from tco.geometry import rigid, so3_exp
+from tco.context import detached
+from tco.geometry import invert, rigid, so3_exp
 from tco.optimize import optimize
-from tco.options import PolishConfig, TCOConfig
+from tco.options import AblationConfig, PolishConfig, TCOConfig
 from tco.penalties import in_first_view, rotation_angle
 from tco.terms import ExtraTerm, Terms, means
 from tco.toy import Toy, Wall, wall
 from tco.types import Cameras, HeldCameras, Prediction, Priors, SparseDepth, Views
+
+PARITY = Path(__file__).parents[3] / "shared" / "parity"
 
 
 @pytest.fixture(scope="module")
@@ -88,8 +95,13 @@ def test_poses_are_found_from_depths(scene: Wall) -> None:
 def test_a_weight_without_its_data_is_an_error(scene: Wall) -> None:
     with pytest.raises(ValueError, match="no dense depth"):
         Terms(scene.views, scene.priors, TCOConfig(depth_weight=1.0))
-    with pytest.raises(ValueError, match="overlap and sparse points"):
-        Terms(scene.views, replace(scene.priors, sparse=None), TCOConfig())
+    for nothing in (torch.zeros_like(scene.depth), scene.depth * ~scene.views.valid):
+        with pytest.raises(ValueError, match="dense depth is empty"):
+            Terms(scene.views, replace(scene.priors, depth=nothing), TCOConfig(depth_weight=1.0))
+    bare = replace(scene.priors, sparse=None, overlap=None)
+    with pytest.raises(ValueError, match="no sparse points"):
+        Terms(scene.views, bare, TCOConfig())
+    assert Terms(scene.views, bare, TCOConfig(sparse_weight=0)).overlap.sum() == 4 * 3
     with pytest.raises(ValueError, match="toy needs cameras"):
         optimize(Untold(), scene.views, Priors(depth=scene.depth), TCOConfig(steps=1))
 
@@ -114,7 +126,38 @@ def test_dense_depth_is_compared_after_one_scale_and_shift(scene: Wall) -> None:
     assert float(of_source(scene, scene.depth, other, depth=1.0)["depth"]) < 1e-5
     bent = scene.depth * (1 + 0.1 * torch.linspace(0, 1, 64))
     assert float(of_source(scene, bent, other, depth=1.0)["depth"]) > 0.01
-    assert of_source(scene, bent, torch.zeros_like(other), depth=1.0) == {}
+    other[1] = 0
+    assert of_source(scene, bent, other, depth=1.0)["depth"].isfinite()
+
+
+def test_the_scale_and_shift_of_dense_depth_are_those_of_all_views(scene: Wall) -> None:
+    """One view that drifts against the others is wrong, though by itself it would fit."""
+    assert scene.priors.cameras is not None
+    terms = Terms(scene.views, replace(scene.priors, depth=scene.depth), TCOConfig(depth_weight=1.0))
+    now = Prediction(scene.depth, torch.full_like(scene.depth, 10.0), scene.priors.cameras, (0, 1, 2, 3))
+    alone = replace(now, depth=1.5 * scene.depth[1:2], confidence=now.confidence[1:2], views=(1,))
+    drifted = now.depth.clone()
+    drifted[1] *= 1.5
+
+    def term(part: Prediction, context: Prediction) -> float:
+        return float(terms.of_source(1, [], part, context, terms.given, {"depth": 1.0})["depth"])  # type: ignore[arg-type]
+
+    mask = scene.depth > 0
+    assert term(alone, now) == pytest.approx(float(penalties.depth(drifted, scene.depth, mask, [1])))
+    assert term(alone, now) > 0.05 * float(scene.depth.mean())
+    assert term(replace(now, depth=drifted), now) == pytest.approx(
+        float(penalties.depth(drifted, scene.depth, mask))
+    )
+
+
+def test_a_view_of_which_dense_depth_says_nothing_has_no_term(scene: Wall) -> None:
+    other = scene.depth.clone()
+    other[1] = 0
+    assert scene.priors.cameras is not None
+    terms = Terms(scene.views, replace(scene.priors, depth=other), TCOConfig(depth_weight=1.0))
+    now = Prediction(scene.depth, torch.full_like(scene.depth, 10.0), scene.priors.cameras, (0, 1, 2, 3))
+    alone = replace(now, depth=scene.depth[1:2], confidence=now.confidence[1:2], views=(1,))
+    assert terms.of_source(1, [], alone, now, scene.priors.cameras, {"depth": 1.0}) == {}
 
 
 def test_dense_depth_with_standard_deviations_is_compared_as_it_is(scene: Wall) -> None:
@@ -228,6 +271,68 @@ def test_a_networks_own_cameras_are_held_to_what_is_known(scene: Wall) -> None:
     assert turn(after.cameras.world_from_cam) < 0.25 * turn(before.cameras.world_from_cam)
     assert set(after.history[0]) == {"rotation", "translation", "loss"}
     assert after.history[-1]["loss"] < 0.3 * after.history[0]["loss"]
+
+
+def test_cameras_are_held_in_standard_deviations_where_these_are_known(scene: Wall) -> None:
+    """A turn of one standard deviation costs ½ of the views' shares; without sigmas, its angle."""
+    true = Moving(scene, 0.0).true
+    turned = true.world_from_cam.clone()
+    turned[2] = turned[2] @ rigid(so3_exp(torch.tensor([0.0, 0.03, 0.0])), torch.zeros(3))
+    ours = Cameras(turned, true.K * (1 + 0.02 * torch.tensor([1.0, 1.0, 0.0]).diag()))
+    sigma = torch.full((4,), 0.03 / math.sqrt(2))
+    plain = HeldCameras(true)
+    by_sigma = HeldCameras(true, rotation_sigma=sigma, translation_sigma=sigma, focal_sigma=sigma)
+    assert float(penalties.held("rotation", ours, plain)) == pytest.approx(0.03 / 4, rel=1e-3)
+    assert float(penalties.held("rotation", ours, by_sigma)) == pytest.approx(0.5 / 3, rel=1e-3)
+    size = math.log(1.02) / 0.03 * math.sqrt(2)
+    assert float(penalties.held("focal", ours, by_sigma)) == pytest.approx(0.5 * size**2, rel=1e-3)
+    assert float(penalties.held("translation", ours, by_sigma)) == pytest.approx(0, abs=1e-6)
+    focal = float(true.K[0, 0, 0])
+    assert float(penalties.held("focal", ours, plain)) == pytest.approx(0.04 * focal, rel=1e-3)
+    published = float(penalties.held("focal", ours, plain, published=True))
+    assert published == pytest.approx(4 * (0.02 * focal - 0.5) / 6, rel=1e-3)
+
+
+def test_one_view_alone_has_no_relative_pose_to_hold(scene: Wall) -> None:
+    true = Moving(scene, 0.0).true
+    one = Views(scene.views.images[:1], scene.views.valid[:1], ("a",))
+    terms = Terms(one, Priors(held=HeldCameras(true[:1])), TCOConfig())
+    assert terms.weights(0, False).keys() & {"rotation", "translation", "focal"} == {"focal"}
+
+
+@pytest.mark.skipif(not PARITY.exists(), reason="the published numbers are not beside this checkout")
+@pytest.mark.parametrize("term", ["photometric", "geometric"])
+def test_parity_of_the_published_objective_as_the_optimiser_has_it(term: str) -> None:
+    """Losses of the published code and their gradients, those by the depths of the targets included."""
+    data = {k: torch.from_numpy(v) for k, v in np.load(PARITY / "tco_losses.npz").items()}
+    short = {"photometric": "photo", "geometric": "geom"}[term]
+    expected = json.loads((PARITY / "tco_losses.json").read_text())
+    depth, images = data["depth"].clone().requires_grad_(True), data["images"]
+    views = Views(images, torch.ones_like(depth, dtype=torch.bool), ("a",) * len(images))
+    cameras = Cameras(data["cam_to_world"], data["K"])
+    schedule = TCOConfig(
+        sparse_weight=0.0,
+        depth_weight=1.0,
+        photometric_weight=1.0,
+        geometric_weight=1.0,
+        ablation=AblationConfig(published_objective=True),
+    ).reference_schedule()
+    known = Cameras(invert(data["prior_cam_from_world"]), data["prior_K"])
+    prior = data["prior_depth"] * data["prior_depth_mask"]
+    terms = Terms(views, Priors(depth=prior, held=HeldCameras(known)), schedule)
+    now = Prediction(depth, data["conf"], cameras, tuple(range(len(depth))))
+    source = int(data[f"{short}_source_view"][0])
+    weights = {name: 1.0 for name in (term, "depth", "rotation", "translation", "focal")}
+    found = terms.of_source(source, now.views, now, detached(now), cameras, weights)
+    assert found[term].item() == pytest.approx(expected[f"{short}_loss"], rel=1e-5)
+    # The published angle is an arc cosine clamped to 1 − 1e-7, which gives the first view an angle too.
+    assert float(found["rotation"]) == pytest.approx(expected["rot_angle_mean"], rel=1e-3)
+    assert float(found["translation"]) == pytest.approx(expected["trans_normed_l1_mean"], rel=1e-4)
+    assert float(found["focal"]) == pytest.approx(expected["intrinsics_reference"], rel=1e-4)
+    found[term].backward()
+    theirs = data[f"{short}_grad_depth"]
+    assert depth.grad is not None
+    assert float((depth.grad - theirs).norm()) < 1e-4 * float(theirs.norm())
 
 
 def test_cameras_cannot_be_given_and_held(scene: Wall) -> None:

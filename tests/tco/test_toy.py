@@ -114,15 +114,15 @@ def test_the_plane_is_found(scene: Wall) -> None:
     ("config", "share"),
     [
         (replace(FIT, sources=2), 0.35),
-        (replace(FIT, lazy_refresh=True, refresh=3), 0.35),
         (FIT.reference_schedule(), 0.35),
+        (replace(FIT, ablation=AblationConfig(published_objective=True)).reference_schedule(), 0.35),
         (replace(FIT, ablation=AblationConfig(source_order="overlap")), 0.4),
         (replace(FIT, ablation=AblationConfig(confident_opacity=False, radius_factor=1.0)), 0.35),
         (replace(FIT, ablation=AblationConfig(free_surfels=True)), 0.35),
         (replace(FIT, lora_targets=(), ablation=AblationConfig(unfrozen=("plane",))), 0.5),
         (replace(FIT, lora_targets=(), ablation=AblationConfig(free_depth=True, free_rate=0.03)), 0.85),
     ],
-    ids=["sources", "lazy", "reference", "overlap", "opaque", "surfels", "unfrozen", "depth"],
+    ids=["sources", "reference", "published", "overlap", "opaque", "surfels", "unfrozen", "depth"],
 )
 def test_every_variant_lowers_the_error(scene: Wall, config: TCOConfig, share: float) -> None:
     before = optimize(Toy(), scene.views, scene.priors, TCOConfig(steps=0))

@@ -20,8 +20,10 @@ from colmap_tco.datasets import CHOICES, NRGBD
 from colmap_tco.datasets.base import pixel_centres, project
 from colmap_tco.errors import InputError
 from tco.geometry import rigid, so3_exp
-from tco.options import EVERY, TCOConfig
+from tco.objective import ObjectiveConfig
+from tco.options import EVERY, AblationConfig, TCOConfig
 from tco.penalties import in_first_view, rotation_angle
+from tco.terms import comparison
 from tco.types import Cameras
 from tests.colmap_tco.datasets import layouts
 from tests.tco.published import tiny_vggt
@@ -197,6 +199,11 @@ def test_published_settings_are_those_of_the_scripts_unless_the_user_says_otherw
     assert published("dtu", TCOConfig(steps=7)).steps == 7
     poses = published("scannet", TCOConfig())
     assert (poses.photometric_weight, poses.geometric_weight, poses.depth_weight) == (0, 1, 1)
+    for dataset in CHOICES:
+        objective, surfels = comparison(published(dataset, TCOConfig()))
+        assert objective == ObjectiveConfig.reference() and surfels.pixel_centre == 0
+    own = TCOConfig(ablation=AblationConfig(radius_factor=1.0))
+    assert comparison(published("dtu", own))[0].renderer == "surface"
 
 
 def test_published_figures_have_their_source_and_their_gaps() -> None:
