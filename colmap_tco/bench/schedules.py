@@ -3,7 +3,8 @@
 ``scripts/tco_vggt_*.sh`` and ``configs/evaluation/{mv_recon,relpose-distance}.yaml`` of
 github.com/cvlab-stonybrook/TCO. Adapters of rank 4 and alpha 16 on qkv, proj, fc1 and fc2, gradients clipped
 at a norm of 1; a source view is drawn uniformly, all views are decoded in every step, and every view is a
-target (:meth:`tco.options.TCOConfig.reference_schedule`), compared as the code does (``published_objective``).
+target (:meth:`tco.options.TCOConfig.reference_schedule`), compared as that code does
+(``published_objective``).
 What differs here: docs/bench.md.
 """
 
