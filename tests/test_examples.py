@@ -134,7 +134,7 @@ def test_export_splatting_keeps_every_point_on_its_rays(densified: tuple[Room, s
 
 
 def test_picture_draws_the_cloud_as_a_camera_saw_it(densified: tuple[Room, str], tmp_path: Path) -> None:
-    """The first of three panels, on white, has the colours of one of the pictures; the others are elsewhere."""
+    """The first of three panels, on white, has the colours of a picture; the others are from elsewhere."""
     room, _ = densified
     run("picture.py", dense_paths(room.root).root, tmp_path / "cloud.png")
     drawn = cv2.imread(str(tmp_path / "cloud.png")).astype(int)
