@@ -57,6 +57,19 @@ class Setting:
             return (f"--{self.name}", f"--no_{self.name}")
         return (f"--{self.name}", self.alias) if self.alias else (f"--{self.name}",)
 
+    @property
+    def metavar(self) -> str:
+        """What stands for the value in help texts; a switch has none."""
+        if self.base is bool:
+            return ""
+        one = "{" + ",".join(self.choices) + "}" if self.choices else _METAVARS[self.base]
+        return f"{one},…" if self.many else one
+
+    @property
+    def default_word(self) -> str:
+        """The default as help texts tell it."""
+        return self.show(self.default) or "empty"
+
     def parse(self, text: str) -> Any:
         """The value that a word of the command line stands for.
 
@@ -148,9 +161,8 @@ def add_flags(parser: argparse.ArgumentParser, config_type: type) -> None:
     groups: dict[type, argparse._ArgumentGroup] = {}
     for setting in settings(config_type):
         if setting.owner not in groups:
-            groups[setting.owner] = parser.add_argument_group(_title(setting.owner))
-        default = setting.show(setting.default) or "empty"
-        text = f"{setting.help} (default: {default})".replace("%", "%%")
+            groups[setting.owner] = parser.add_argument_group(title(setting.owner))
+        text = f"{setting.help} (default: {setting.default_word})".replace("%", "%%")
         if setting.base is bool:
             groups[setting.owner].add_argument(
                 *setting.flags,
@@ -166,9 +178,18 @@ def add_flags(parser: argparse.ArgumentParser, config_type: type) -> None:
                 dest=setting.name,
                 type=setting.parse,
                 default=argparse.SUPPRESS,
-                metavar=_metavar(setting),
+                metavar=setting.metavar,
                 help=text,
             )
+
+
+def title(owner: type) -> str:
+    """The title of a group of flags: the docstring's first line, or the class name where there is none."""
+    written = (owner.__doc__ or "").strip()
+    # dataclasses without a docstring get their signature as one
+    if not written or written.startswith(f"{owner.__name__}("):
+        return owner.__name__
+    return written.splitlines()[0].rstrip(".")
 
 
 def build(config_type: type[T], namespace: argparse.Namespace) -> T:
@@ -263,20 +284,6 @@ def _check_default(setting: Setting, where: str) -> None:
             raise ValueError(f"the default of {where}, {value!r}, is not of its type")
         if setting.choices and value not in setting.choices:
             raise ValueError(f"the default of {where}, {value!r}, is not one of {setting.choices}")
-
-
-def _title(owner: type) -> str:
-    """A group's title: the first line of the docstring, or the class name where there is none."""
-    written = (owner.__doc__ or "").strip()
-    # dataclasses without a docstring get their signature as one
-    if not written or written.startswith(f"{owner.__name__}("):
-        return owner.__name__
-    return written.splitlines()[0].rstrip(".")
-
-
-def _metavar(setting: Setting) -> str:
-    one = "{" + ",".join(setting.choices) + "}" if setting.choices else _METAVARS[setting.base]
-    return f"{one},…" if setting.many else one
 
 
 def _underscored(word: str) -> str:

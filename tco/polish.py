@@ -8,7 +8,8 @@ move, colours are looked up where the pixel falls (:mod:`tco.warping`) and not r
 that a step costs a fraction of one that adapts, and all views' depths are those of the moment.
 
 The paper optimises surfels directly as an ablation, without a network, and finds it worse (arXiv 2604.03878).
-Coarse grids make the difference: a grid of every pixel follows the noise of the pictures.
+Here that comes after the network, and on coarse grids; cells of one pixel are better on some sets and by some
+measures and worse by others (``docs/ablations.md``).
 """
 
 from __future__ import annotations

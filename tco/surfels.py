@@ -83,9 +83,9 @@ def from_depth(
     """Surfels of one view, differentiable in depth, camera, image and confidence.
 
     The tangents and radii come from the gradients g_u, g_v of the point map (central differences,
-    one-sided at the border): t_u = g_u / |g_u|, n ∝ t_u × t_v, t_v = n × t_u, radii r · |n_z| · |g_u|
-    and r · |n_z| · |g_v · t_v|. The image's v axis points down, so −g_v is used to keep n towards the
-    camera and the frame right-handed, as the authors' code does.
+    one-sided at the border): t_u = g_u / |g_u|, n ∝ −t_u × g_v, t_v = n × t_u, radii r · |n_z| · |g_u|
+    and r · |n_z| · |g_v · t_v|. The image's v axis points down, so that −g_v makes n face the camera; the
+    frame is right-handed, as in the authors' code.
 
     Args:
         depth: (H, W) camera z.

@@ -133,6 +133,23 @@ def test_export_splatting_keeps_every_point_on_its_rays(densified: tuple[Room, s
     assert np.median(off_surface(room, np.array(list(xyz.values())))) < 0.02
 
 
+def test_picture_draws_the_cloud_as_a_camera_saw_it(densified: tuple[Room, str], tmp_path: Path) -> None:
+    """The first of three panels, on white, has the colours of a picture; the others are from elsewhere."""
+    room, _ = densified
+    run("picture.py", dense_paths(room.root).root, tmp_path / "cloud.png")
+    drawn = cv2.imread(str(tmp_path / "cloud.png")).astype(int)
+    size = drawn.shape[1] // 3, drawn.shape[0]
+    panels = np.split(drawn, 3, axis=1)
+    assert all(0.05 < (panel < 255).any(2).mean() < 0.95 for panel in panels)
+
+    def off(panel: Floats, name: str) -> float:
+        seen = cv2.resize(cv2.imread(str(dense_paths(room.root).image(name))), size).astype(int)
+        return float(np.median(np.abs(panel - seen)[(panel < 255).any(2)]))
+
+    errors = [min(off(panel, name) for name in room.names) for panel in panels]
+    assert errors[0] < 3 and errors[0] < 0.5 * min(errors[1:])
+
+
 def test_custom_backbone_is_a_mean_of_depths_that_adapting_improves(scene: Scene, truth: Tensor) -> None:
     network = custom_backbone.Interpolator()
     assert isinstance(network, Backbone)

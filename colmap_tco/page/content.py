@@ -201,7 +201,7 @@ MARGIN = 0.93
 
 
 def view_maps(paths: DensePaths, view: View, scale: float) -> tuple[dict[str, Any], int]:
-    """Image, depth, confidence and normals of one view as data URIs, and their bytes.
+    """Image, depth, confidence, standard error and normals of one view as data URIs, and their bytes.
 
     A map that is made smaller keeps values of single pixels; it is never averaged.
     """
@@ -216,12 +216,12 @@ def view_maps(paths: DensePaths, view: View, scale: float) -> tuple[dict[str, An
     found: dict[str, Any] = {"width": width, "height": height}
     picture = cv2.resize(read_image(paths.image(view.name)), (width, height), interpolation=cv2.INTER_AREA)
     found["image"] = photograph(np.asarray(picture, np.uint8))
-    for kind, path in (
-        ("depth", paths.depth_map(view.name)),
-        ("confidence", paths.confidence_map(view.name)),
-    ):
+    coded = {"depth": paths.depth_map(view.name), "confidence": paths.confidence_map(view.name)}
+    if paths.error_map(view.name).is_file():  # a result of an earlier version has none
+        coded["error"] = paths.error_map(view.name)
+    for kind, path in coded.items():
         codes, low, high = levels(small(read_map(path)))
         found[kind] = {"codes": lossless(codes), "low": low, "high": high}
     found["normal"] = lossless(normal_codes(small(read_map(paths.normal_map(view.name)))))
-    uris = [found["image"], found["depth"]["codes"], found["confidence"]["codes"], found["normal"]]
+    uris = [found["image"], found["normal"], *(found[kind]["codes"] for kind in coded)]
     return found, sum(map(len, uris))

@@ -1,7 +1,8 @@
 """The definition of the renderer, plain and slow: every surfel on every pixel in float64.
 
-Tests compare the fast engines with it. It shares no code with them: a surfel is intersected with the
-ray of each pixel in camera coordinates, and the weights of a pixel are computed for all surfels at once.
+Tests compare the fast engines with it. It shares thresholds and helpers of geometry with them, and not the
+computation: a surfel is intersected with the ray of each pixel in camera coordinates, and the weights of a
+pixel are computed for all surfels at once.
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 import os
 import re
@@ -22,7 +23,7 @@ from colmap_tco.dense import dense_views
 from colmap_tco.densify import DensifyConfig, densify
 from colmap_tco.maps import read_map
 from colmap_tco.page.content import Limits, content
-from colmap_tco.page.quantise import level_values, normal_values
+from colmap_tco.page.quantise import level_values, normal_values, packed
 from colmap_tco.page.write import filled, write_page
 from colmap_tco.ply import read_ply, read_vis
 from colmap_tco.priors import usable_points
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 
     from tests.conftest import Room
 
+PAGE = Path(_pycolmap.__file__).parent / "page"
 TCO = TCOConfig(steps=2, polish=PolishConfig(polish_looks=1))
 
 
@@ -94,11 +96,13 @@ def test_the_maps_on_the_page_are_the_maps_on_disk(paths: DensePaths, embedded: 
         for kind, path in (
             ("depth", paths.depth_map(view["name"])),
             ("confidence", paths.confidence_map(view["name"])),
+            ("error", paths.error_map(view["name"])),
         ):
             exact, coded = read_map(path), maps[kind]
             back = level_values(picture(coded["codes"]), coded["low"], coded["high"])
             assert ((back > 0) == (exact > 0)).all()
             there = exact > 0
+            assert there.mean() > 0.2
             bound = (coded["high"] / coded["low"]) ** (1 / 508) - 1
             assert np.abs(np.log(back[there] / exact[there])).max() <= np.log1p(bound) + 1e-6
         normal = read_map(paths.normal_map(view["name"]))
@@ -155,7 +159,8 @@ def test_a_large_result_is_thinned_and_made_smaller(paths: DensePaths) -> None:
     assert small["cloud"]["count"] == 500 < small["cloud"]["all"]
     shown = [view["maps"] for view in small["views"] if "maps" in view]
     assert shown
-    size = sum(len(m["image"] + m["depth"]["codes"] + m["confidence"]["codes"] + m["normal"]) for m in shown)
+    coded = ("depth", "confidence", "error")
+    size = sum(len(m["image"] + m["normal"] + "".join(m[kind]["codes"] for kind in coded)) for m in shown)
     assert size <= 60_000
     assert max(max(m["width"], m["height"]) for m in shown) >= 64
     assert all(view["errors"]["count"] <= 50 for view in small["views"])
@@ -172,6 +177,19 @@ def test_the_page_asks_for_nothing(paths: DensePaths) -> None:
     assert "default-src 'none'" in page
     assert not re.search(r"""(?:src|href)\s*=\s*["']?(?:https?:|//)""", page)
     assert paths.page.stat().st_size < 15e6
+
+
+def test_the_built_page_is_that_of_its_sources() -> None:
+    web = PAGE / "web"
+    digest = hashlib.sha256()
+    for name in ("build.mjs", "package-lock.json", *sorted(f"src/{p.name}" for p in (web / "src").iterdir())):
+        digest.update(f"{name}\n".encode() + (web / name).read_bytes())
+    built = re.search(
+        r'<meta name="built-from" content="(\w+)">', (PAGE / "built/page.html").read_text("utf-8")
+    )
+    assert built is not None and built[1] == digest.hexdigest(), (
+        "npm ci && node build.mjs in a copy of colmap_tco/page/web makes it anew"
+    )
 
 
 def test_the_command_makes_the_page_anew(paths: DensePaths) -> None:
@@ -275,7 +293,7 @@ def test_a_click_on_a_view_shows_its_maps(
     there = depth > 0
     ranks = [np.argsort(np.argsort(values[there])) for values in (brightness, depth)]
     assert np.corrcoef(*ranks)[0, 1] < -0.9
-    for kind in ("image", "confidence", "normal"):
+    for kind in ("image", "confidence", "normal", "error"):
         assert len(np.unique(drawn(page, f"#view [data-map={kind}] canvas").reshape(-1, 4), axis=0)) > 50
     assert not faults
 
@@ -300,6 +318,58 @@ def test_curves_map_and_table_are_there(opened: tuple[Page, list[str], list[str]
     assert "[object" not in page.inner_text("body")
     page.click("#map svg g.view[data-name='view_2.png'] path", force=True)
     page.wait_for_selector("#view[data-name='view_2.png']")
+
+
+def test_curves_say_where_the_steps_on_the_depths_begin(opened: tuple[Page, list[str], list[str]]) -> None:
+    page = opened[0]
+    assert "Steps 1 to 2 adapt the network" in page.inner_text("#curves .parts")
+    assert page.locator("#curves figure[data-term=loss] line.turn").count() == 1
+    named = page.locator("#curves h3").all_inner_texts()
+    # What has no words of its own is shown by its key, which is small.
+    assert named and all(name[0].isupper() for name in named)
+
+
+def test_both_passes_of_the_fusion_are_told(
+    opened: tuple[Page, list[str], list[str]], paths: DensePaths
+) -> None:
+    page, fusion = opened[0], json.loads(paths.report.read_text("utf-8"))["fusion"]
+    told = page.inner_text("#settings").replace("\u202f", "")
+    for part in (fusion, fusion["gaps"]):
+        for figures in (part["pixels"], part["comparisons_failed"]):
+            assert all(str(number) in told for number in figures.values())
+        assert f"{100 * part['tolerance']['depth']:.2f} %" in told
+
+
+def test_the_ground_has_the_colour_of_how_many_views_saw_it(
+    paths: DensePaths, browser: Browser, tmp_path: Path
+) -> None:
+    """Left of the middle, as the pictures have it, 3 views; right of it 9: one colour each, and a legend."""
+    report = json.loads(paths.report.read_text("utf-8"))
+    data = content(paths, report)
+    data["report"]["seconds"] |= {"optimisation": 1e-4}
+    cloud, axes = data["cloud"], [view["axes"] for view in data["views"] if "axes" in view]
+    points = np.array(cloud["corner"]) + unpacked(cloud["xyz"], "<u2", 3) * np.array(cloud["step"])
+    across = np.cross(np.sum([a[2] for a in axes], axis=0), data["up"])
+    right = points @ across > np.median(points @ across)
+    cloud["seen"] = packed(np.where(right, 9, 3).astype(np.uint8))
+    file = tmp_path / "page.html"
+    file.write_text(filled(data), "utf-8")
+    page = browser.new_page()
+    page.goto(file.as_uri())
+    page.wait_for_selector("#view figure[data-map=depth] canvas")
+    assert "3 views" in page.inner_text("#map [data-legend=seen]")
+    assert "9 views" in page.inner_text("#map [data-legend=seen]")
+    assert "in this run; the depth maps were there" in page.inner_text("#head")
+    canvas = drawn(page, "#map canvas")
+    columns = np.nonzero(canvas[..., 3])[1]
+    few, many = (np.where((canvas[..., :3] == bgr).all(2) & (canvas[..., 3] > 0))[1] for bgr in VIRIDIS_ENDS)
+    assert len(few) + len(many) > 0.9 * len(columns)
+    assert few.max() <= many.min()
+    page.close()
+
+
+VIRIDIS_ENDS = (84, 1, 68), (37, 231, 253)
+"""Blue, green, red."""
 
 
 def test_an_empty_cloud_has_a_page_that_says_why(paths: DensePaths, browser: Browser, tmp_path: Path) -> None:

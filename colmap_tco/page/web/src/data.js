@@ -32,6 +32,7 @@ const ramp = (stops) => (t) => {
 };
 export const viridis = ramp([[68, 1, 84], [71, 44, 122], [59, 81, 139], [44, 113, 142], [33, 144, 141], [39, 173, 129], [92, 200, 99], [170, 220, 50], [253, 231, 37]]);
 export const warm = ramp([[252, 253, 191], [254, 194, 135], [251, 135, 97], [222, 73, 104], [165, 44, 122], [101, 26, 128], [40, 17, 89], [10, 6, 30]]);
+export const heat = ramp([[254, 224, 139], [253, 174, 97], [244, 109, 67], [215, 48, 39], [140, 10, 38]]);
 export const signed = ramp([[33, 102, 172], [103, 169, 207], [240, 240, 240], [239, 138, 98], [178, 24, 43]]);
 export const css = (c) => `rgb(${c.map(Math.round).join(',')})`;
 export const gradient = (of) => `linear-gradient(to right, ${Array.from({ length: 9 }, (_, i) => css(of(i / 8))).join(',')})`;

@@ -1,4 +1,4 @@
-import { count, data, make, onSelect, percent, select } from './data.js';
+import { count, data, digits, make, onSelect, percent, select } from './data.js';
 import { startCurves, startMap } from './charts.js';
 import { startScene } from './scene.js';
 import { startViews } from './views.js';
@@ -15,7 +15,7 @@ function head() {
     [percent(held.median_error), `median error at ${count(held.points)} held-out points`],
     [percent(held.within_5_percent, 1), 'of them within 5 %'],
     [report.backbone.name, `network, on ${report.device}`],
-    [time(total), 'in all'],
+    [time(total), report.seconds.optimisation < 0.1 ? 'in this run; the depth maps were there' : 'in all'],
   ];
   id('head').append(make('h1', {}, data.title), make('ul', { class: 'facts' }, ...facts.map(([value, name]) => make('li', {}, make('b', {}, value), make('span', {}, name)))));
   if (!held.plausible) id('head').append(make('p', { class: 'warn' }, `The depths contradict COLMAP’s points: their median error is ${percent(held.error)}, where one depth for each view would have ${percent(held.error_of_one_depth)}. Do not use them.`));
@@ -34,11 +34,34 @@ function rows() {
   onSelect((name) => { for (const row of table.tBodies[0].rows) row.classList.toggle('on', row.dataset.name === name); });
 }
 
-const bars = (title, entries, form) => {
-  const most = Math.max(...entries.map(([, value]) => value), 1e-9);
-  return make('figure', {}, make('h3', {}, title), make('table', {}, make('tbody', {}, ...entries.map(([name, value]) =>
-    make('tr', {}, make('th', { scope: 'row', style: 'font-weight:400' }, name.replaceAll('_', ' ')), make('td', { class: 'n' }, form(value)), make('td', { style: 'width:40%' }, make('span', { class: 'bar', style: `width:${100 * value / most}%` })))))));
+// The names of columns that are two cells wide, after one for the rows' names.
+const headed = (heads) => (heads.length ? make('thead', {}, make('tr', {}, make('td', {}), ...heads.map((head) => make('th', { scope: 'col', colspan: 2, class: 'n' }, head)))) : null);
+
+// A table of rows [name, value, …], a bar beside each value; heads names the columns of values.
+const bars = (title, entries, form, heads = []) => {
+  const most = Math.max(...entries.flatMap(([, ...values]) => values), 1e-9), wide = 40 / Math.max(1, heads.length);
+  return make('figure', {}, make('h3', {}, title), make('table', {},
+    headed(heads), make('tbody', {}, ...entries.map(([name, ...values]) => make('tr', {}, make('th', { scope: 'row', style: 'font-weight:400' }, name.replaceAll('_', ' ')),
+      ...values.flatMap((value) => [make('td', { class: 'n' }, form(value)), make('td', { style: `width:${wide}%` }, make('span', { class: 'bar', style: `width:${100 * value / most}%` }))]))))));
 };
+
+// The passes of the fusion: over the views' own depths, and over those that they agreed on, where there are gaps.
+const passes = () => Object.entries({ 'each view’s own depths': report.fusion, 'gaps, of depths agreed on': report.fusion?.gaps }).filter(([, pass]) => pass?.pixels);
+
+function fates() {
+  const all = passes(), names = Object.keys(all[0]?.[1].pixels || {});
+  return bars('What became of the pixels in the fusion', names.map((name) => [name, ...all.map(([, pass]) => pass.pixels[name])]), count, all.length > 1 ? all.map(([head]) => head) : []);
+}
+
+const TESTS = [['max_depth_error', 'depth', (v) => percent(v)], ['max_reproj_error', 'reproj', (v) => `${digits(v)} px`], ['max_normal_error', 'normal', (v) => `${digits(v)}°`]];
+function agreement() {
+  const all = passes().filter(([, pass]) => pass.tolerance);
+  if (!all.length) return null;
+  const body = TESTS.map(([test, key, form]) => make('tr', {}, make('th', { scope: 'row', style: 'font-weight:400' }, test.replaceAll('_', ' ')),
+    ...all.flatMap(([, pass]) => [make('td', { class: 'n' }, form(pass.tolerance[key])), make('td', { class: 'n' }, `${count(pass.comparisons_failed[test])} failed`)])));
+  return make('figure', { 'data-table': 'agreement' }, make('h3', {}, 'When a pixel and a neighbour agree'), make('table', {}, headed(all.length > 1 ? all.map(([head]) => head) : []), make('tbody', {}, ...body)),
+    make('p', { class: 'small soft' }, 'The largest difference that was allowed, as set or widened to the noise of the depths, and how often it was the first that was exceeded.'));
+}
 
 function flat(value, prefix = '') {
   if (value === null || typeof value !== 'object' || Array.isArray(value)) return [[prefix, JSON.stringify(value)]];
@@ -48,9 +71,8 @@ const listing = (title, value, open = false) => make('details', { open }, make('
   make('table', {}, make('tbody', {}, ...flat(value).map(([key, text]) => make('tr', {}, make('th', { scope: 'row', style: 'font-weight:400' }, key), make('td', {}, text))))));
 
 function settings() {
-  const { pixels = {}, gaps } = report.fusion || {}, holder = id('settings');
-  const fates = [...Object.entries(pixels), ...(gaps ? [['points in gaps, of depths that the views agreed on', gaps.pixels.points]] : [])];
-  holder.append(make('div', { class: 'two' }, bars('What became of the pixels in the fusion', fates, count), bars('Time', Object.entries(report.seconds), time)),
+  const holder = id('settings');
+  holder.append(make('div', { class: 'two' }, fates(), make('div', { class: 'column' }, ...[agreement(), bars('Time', Object.entries(report.seconds), time)].filter(Boolean))),
     listing('Network, model and images', { backbone: report.backbone, device: report.device, ...report.workspace }),
     listing('Settings', report.settings), listing('Versions', report.versions));
   holder.append(make('footer', {}, 'Made by colmap-tco; the numbers are in report.json. This page needs no network.'));

@@ -1,5 +1,5 @@
 // The strip of views, and the maps of the one that is selected.
-import { css, data, digits, f32, gradient, level, make, onSelect, percent, pixels, select, signed, u16, u8, viridis, warm } from './data.js';
+import { css, data, digits, f32, gradient, heat, level, make, onSelect, percent, pixels, select, signed, u16, u8, viridis, warm } from './data.js';
 
 const WORST = 0.05; // relative error at which the colours of the dots end
 const shown = { used: true, held: true };
@@ -83,24 +83,26 @@ async function show(holder, name) {
     make('span', { class: 'soft' }, `error at held-out points ${percent(view.error_at_held_out)} (median of ${view.points_held_out}), within 5 %: ${percent(view.held_out_within_5_percent, 1)}`),
     make('span', { class: 'soft' }, `at points that were used ${percent(view.error_at_points)} (of ${view.points})`));
   if (!view.maps) { holder.replaceChildren(head, make('p', { class: 'soft' }, 'The maps of this view were left out to keep the page small; they are in stereo/.')); return; }
-  const maps = view.maps, [depth, sure, normal, image] = await Promise.all([codesOf(maps.depth.codes, maps), codesOf(maps.confidence.codes, maps), pixels(maps.normal, maps.width, maps.height), pixels(maps.image, maps.width, maps.height)]);
+  const maps = view.maps, [depth, sure, apart, normal, image] = await Promise.all([codesOf(maps.depth.codes, maps), codesOf(maps.confidence.codes, maps), maps.error ? codesOf(maps.error.codes, maps) : null, pixels(maps.normal, maps.width, maps.height), pixels(maps.image, maps.width, maps.height)]);
   if (mine !== turn) return;
-  const [near, far] = middle(depth, maps.depth), [doubt, trust] = middle(sure, maps.confidence);
-  const distance = (z) => (far > near ? Math.log(z / near) / Math.log(far / near) : 0.5), sureness = (c) => (trust > doubt ? Math.log(c / doubt) / Math.log(trust / doubt) : 0.5);
+  const spoken = apart?.some((code) => code > 0), [near, far] = middle(depth, maps.depth), [doubt, trust] = middle(sure, maps.confidence), [least, most] = spoken ? middle(apart, maps.error) : [1, 1];
+  const distance = (z) => (far > near ? Math.log(z / near) / Math.log(far / near) : 0.5), sureness = (c) => (trust > doubt ? Math.log(c / doubt) / Math.log(trust / doubt) : 0.5), apartness = (e) => (most > least ? Math.log(e / least) / Math.log(most / least) : 0.5);
   const points = pointsOf(view), factor = Math.max(1, Math.round(900 / maps.width));
   const dots = make('canvas', { width: maps.width * factor, height: maps.height * factor });
   const redraw = () => drawDots(dots, points);
   const box = (key, text) => make('label', {}, make('input', { type: 'checkbox', checked: shown[key], onchange: (e) => { shown[key] = e.target.checked; redraw(); } }), ` ${text}`);
   redraw();
   const read = make('p', { class: 'read', 'aria-live': 'off' }, 'Point at a map to read its values.');
-  const figures = make('div', { class: 'maps' },
+  const figures = make('div', { class: 'maps' }, ...[
     figure('Picture, and error of the depth at COLMAP’s points', 'image', make('div', { class: 'over' }, canvasOf(maps, (i) => image.data.subarray(4 * i, 4 * i + 3)), dots), ...scale(signed, '−5 % too near', '+5 % too far'),
       make('div', { class: 'choices' }, box('used', 'points that were used'), box('held', 'held-out points (ringed)'))),
     figure('Depth', 'depth', canvasOf(maps, (i) => (depth[i] ? warm(distance(level(depth[i], maps.depth))) : NONE)), ...scale(warm, digits(near), digits(far))),
     figure('Confidence', 'confidence', canvasOf(maps, (i) => (sure[i] ? viridis(sureness(level(sure[i], maps.confidence))) : NONE)), ...scale(viridis, digits(doubt), digits(trust))),
+    spoken && figure('Standard error of the depth', 'error', canvasOf(maps, (i) => (apart[i] ? heat(apartness(level(apart[i], maps.error))) : NONE)), ...scale(heat, percent(least), percent(most)),
+      make('p', { class: 'small soft' }, 'By how far apart the views were that see the place. Grey: too few do.')),
     figure('Normals', 'normal', canvasOf(maps, (i) => { const c = [0, 1, 2].map((k) => (normal.data[4 * i + k] - 128) / 124); return c[0] || c[1] || c[2] ? [128 + 127 * c[0], 128 - 127 * c[1], 128 - 127 * c[2]] : NONE; }),
       make('p', { class: 'small soft' }, 'Red: right, green: up, blue: towards the camera.')),
-    figure('Errors at points', 'errors', histogram(points), make('p', { class: 'small soft' }, 'Bars: used. Line: held out. The last bars hold all that is worse.')));
+    figure('Errors at points', 'errors', histogram(points), make('p', { class: 'small soft' }, 'Bars: used. Line: held out. The last bars hold all that is worse.'))].filter(Boolean));
   figures.addEventListener('pointermove', (event) => {
     const canvas = event.target.closest('canvas');
     if (!canvas) return;
@@ -108,7 +110,7 @@ async function show(holder, name) {
     const x = Math.min(maps.width - 1, Math.max(0, Math.floor(u * maps.width))), y = Math.min(maps.height - 1, Math.max(0, Math.floor(v * maps.height))), i = y * maps.width + x;
     let best = 0.012, near_ = '';
     for (let p = 0; p < points.count; p++) { const d = Math.hypot(points.x[p] - u, (points.y[p] - v) * maps.height / maps.width); if (d < best) { best = d; near_ = `, point ${points.held[p] ? 'held out' : 'used'}: ${percent(points.error[p])}`; } }
-    read.textContent = `pixel ${x}, ${y}: depth ${depth[i] ? digits(level(depth[i], maps.depth)) : 'none'}, confidence ${sure[i] ? digits(level(sure[i], maps.confidence)) : 'none'}${near_}`;
+    read.textContent = `pixel ${x}, ${y}: depth ${depth[i] ? digits(level(depth[i], maps.depth)) : 'none'}, confidence ${sure[i] ? digits(level(sure[i], maps.confidence)) : 'none'}${spoken ? `, standard error ${apart[i] ? percent(level(apart[i], maps.error)) : 'none'}` : ''}${near_}`;
   });
   holder.replaceChildren(head, figures, read);
   holder.dataset.name = name;
