@@ -28,6 +28,7 @@ from colmap_tco.fusion import EmptyCloudError, FusionConfig, fuse
 from colmap_tco.lock import locked
 from colmap_tco.mapping import MappingConfig, ensure_model
 from colmap_tco.page.write import write_page
+from colmap_tco.pose_covariance import with_deviations
 from colmap_tco.priors import PriorConfig, with_points
 from colmap_tco.progress import Progress
 from colmap_tco.resume import Result, fingerprint, open_result
@@ -149,6 +150,8 @@ def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified
         workspace = _open_or_map(root, config)
         views, skipped = make_views(workspace, config.views, chosen.network.stride, chosen.network.image_size)
         tracks = read_tracks(workspace.model, logging.INFO)
+        if config.priors.pose_covariance:
+            tracks = with_deviations(tracks, workspace.model)
         views, blind = with_points(tracks, views, config.priors, config.seed)
         pairs = covisibility(tracks, [view.image_id for view in views])
         budget = Budget.of(chosen, views, config.network, config.tco.steps)

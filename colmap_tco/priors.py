@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -38,8 +39,6 @@ SIGMA_LIMIT = 0.2
 """Points whose relative depth is more uncertain than this say nothing and are dropped."""
 PIXEL_FLOOR = 0.1
 """Poses are not known better than this many pixels of rotation."""
-FOCAL_SIGMA = 0.005
-"""Relative uncertainty of a self-calibrated focal length."""
 FEWEST = 4
 """A view with fewer usable points than this says too little of where its surfaces are."""
 WORST = 8
@@ -52,6 +51,28 @@ class PriorConfig:
     holdout: float = knob(
         0.1, "share of the tracks kept out of the optimisation, to measure the error on them; 0 uses all"
     )
+    rotation_sigma: float = knob(
+        0.0,
+        "standard deviation of the cameras' rotations about each axis, degrees; 0: a view's median "
+        "reprojection error over its focal length",
+    )
+    centre_sigma: float = knob(
+        0.0,
+        "standard deviation of the camera centres along each axis, in units of the model; 0: the same, times "
+        "the median depth of the view's points",
+    )
+    focal_sigma: float = knob(0.005, "relative standard deviation of the focal lengths")
+    pose_covariance: bool = knob(
+        False,
+        "add, in squares, what the covariance of COLMAP's bundle adjustment says of each camera, for models "
+        "that hold some of theirs by few points; takes seconds",
+    )
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.holdout < 1:
+            raise ValueError(f"holdout is a share of the tracks, at least 0 and below 1, not {self.holdout}")
+        if min(self.rotation_sigma, self.centre_sigma) < 0 or self.focal_sigma <= 0:
+            raise ValueError("rotation_sigma and centre_sigma must not be negative, focal_sigma be positive")
 
 
 @dataclass(frozen=True)
@@ -156,7 +177,8 @@ def build_priors(
 
     The pose of a view is held as well as its keypoints locate it: σ(rotation) = e / f with e its median
     reprojection error and f its focal length in original pixels, σ(centre) = e / f times its median
-    depth. One error for all its points, because what remains after bundle adjustment is systematic.
+    depth. One error for all its points, because what remains after bundle adjustment is systematic. The
+    settings may give others, or add the covariance of bundle adjustment, if the tracks have it.
     """
     import torch
 
@@ -173,16 +195,16 @@ def build_priors(
         for reason, count in zip(dropped, lost, strict=True):
             dropped[reason] += count
     held = [held_out(points.track, config.holdout, seed) for points in seen]
-    rotation = np.array([_pose_error(tracks, view) for view in views])
     depth = np.array([np.median(points.depth) if len(points.depth) else 1.0 for points in seen])
+    rotation, centre = _pose_sigmas(tracks, views, depth, frame.scale, config)
     common = covisibility(tracks, [view.image_id for view in views]).common
     priors = Priors(
         cameras=canvas_cameras(views, frame),
         sparse=tuple(points.tensors(~mask) for points, mask in zip(seen, held, strict=True)),
         overlap=torch.from_numpy(common).float(),
         rotation_sigma=torch.from_numpy(rotation).float(),
-        centre_sigma=torch.from_numpy(rotation * depth).float(),
-        focal_sigma=torch.full((len(views),), FOCAL_SIGMA),
+        centre_sigma=torch.from_numpy(centre).float(),
+        focal_sigma=torch.full((len(views),), config.focal_sigma),
     )
     return PriorSet(priors, tuple(p.tensors(mask) for p, mask in zip(seen, held, strict=True)), dropped)
 
@@ -209,6 +231,30 @@ def usable_points(tracks: Tracks, view: View) -> tuple[Floats, Floats, Ints]:
     """The points of a view that priors are made of: network pixels (N, 2), depths (N,), COLMAP's ids (N,)."""
     seen, _ = _project(tracks, view, 1.0, (view.network.height, view.network.width))
     return seen.xy, seen.depth, seen.track
+
+
+def _pose_sigmas(
+    tracks: Tracks, views: Sequence[View], depth: Floats, scale: float, config: PriorConfig
+) -> tuple[Floats, Floats]:
+    """Standard deviations of V views' rotations, radians, and centres, units of the chunk, about each axis.
+
+    Args:
+        tracks: of the model.
+        views: V of them.
+        depth: (V,) typical depth of each, units of the chunk.
+        scale: COLMAP units in one of the chunk.
+        config: what the user says of them.
+    """
+    angle = np.array([_pose_error(tracks, view) for view in views])
+    rotation, centre = angle, angle * depth
+    if config.rotation_sigma > 0:
+        rotation = np.full(len(views), math.radians(config.rotation_sigma))
+    if config.centre_sigma > 0:
+        centre = np.full(len(views), config.centre_sigma / scale)
+    if config.pose_covariance:
+        turn, shift = np.array([tracks.deviations[view.image_id] for view in views]).T
+        rotation, centre = np.hypot(rotation, turn), np.hypot(centre, shift / scale)
+    return rotation, centre
 
 
 def _pose_error(tracks: Tracks, view: View) -> float:

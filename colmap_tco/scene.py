@@ -23,6 +23,7 @@ from colmap_tco.chunks import source_views
 from colmap_tco.fusion import FusionConfig, FusionMaps, FusionView, fuse
 from colmap_tco.outputs import ViewMaps, reaches
 from colmap_tco.ply import Cloud
+from colmap_tco.pose_covariance import with_deviations
 from colmap_tco.predict import view_maps
 from colmap_tco.priors import PriorConfig, build_priors, chunk_frame, with_points
 from colmap_tco.tracks import Tracks, covisibility, read_tracks
@@ -148,6 +149,8 @@ def open_scene(
     workspace = open_workspace(root)
     images, _ = make_views(workspace, config, stride)
     tracks = read_tracks(workspace.model)
+    if priors.pose_covariance:
+        tracks = with_deviations(tracks, workspace.model)
     images, _ = with_points(tracks, images, priors, seed)
     frame = chunk_frame(tracks, images)
     views, _ = batch(images, frame)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -49,6 +49,9 @@ class Tracks:
         images: image id → accepted observations.
         centres: image id → (3,) camera centre.
         dropped: reason → number of observations not accepted.
+        deviations: image id → standard deviations of its camera about and along each axis, radians and
+            units of the model, by bundle adjustment (:mod:`colmap_tco.pose_covariance`); empty where nobody
+            asked.
     """
 
     ids: Ints
@@ -58,6 +61,7 @@ class Tracks:
     images: dict[int, Observations]
     centres: dict[int, Floats]
     dropped: dict[str, int]
+    deviations: Mapping[int, tuple[float, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -115,7 +119,7 @@ def read_tracks(model: Model, level: int = logging.DEBUG) -> Tracks:
     singles = int(length[~keep].sum())
     # Rayleigh: the median distance is 1.1774 times the standard deviation along one axis.
     sigma2 = _track_variance(squares[keep], length[keep], typical / 1.1774)
-    covariance = sigma2[:, None, None] * _inverse(information[keep])
+    covariance = sigma2[:, None, None] * inverse(information[keep])
 
     renumber = np.cumsum(keep) - 1
     images = {}
@@ -145,11 +149,25 @@ def _observe(model: Model, entry: Registered, ids: Ints, xyz: Floats) -> tuple[O
     rays = local[:, :2] / z[:, None]
     error = np.linalg.norm(_pycolmap.img_from_cam(entry.camera, rays) - xy, axis=1)
     error[~front | ~np.isfinite(error)] = np.inf
-    J = np.zeros((len(xy), 2, 3))
-    if len(xy):
+    J = image_jacobian(entry, np.concatenate([rays * z[:, None], z[:, None]], 1))
+    return Observations(xy, point, error), J @ R
+
+
+def image_jacobian(entry: Registered, local: Floats) -> Floats:
+    """∂(pixel) / ∂(point) (N, 2, 3) at points (N, 3) before a camera, in its frame; distortion left out."""
+    J = np.zeros((len(local), 2, 3))
+    if len(local):
         J[:, 0, 0], J[:, 1, 1] = _pycolmap.focal_lengths(entry.camera)
-        J[:, :, 2] = -rays * J[:, (0, 1), (0, 1)]
-    return Observations(xy, point, error), (J / z[:, None, None]) @ R
+        J[:, :, 2] = -local[:, :2] / local[:, 2:] * J[:, (0, 1), (0, 1)]
+    return J / local[:, 2, None, None]
+
+
+def skew(vectors: Floats) -> Floats:
+    """[v]× (N, 3, 3) of vectors (N, 3): what turns a product with it into a cross product."""
+    result = np.zeros((len(vectors), 3, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        result[:, i, j], result[:, j, i] = -vectors[:, k], vectors[:, k]
+    return result
 
 
 def _track_variance(squares: Floats, length: Ints, typical: float) -> Floats:
@@ -160,7 +178,7 @@ def _track_variance(squares: Floats, length: Ints, typical: float) -> Floats:
     return result
 
 
-def _inverse(information: Floats) -> Floats:
+def inverse(information: Floats) -> Floats:
     """Inverse of (P, 3, 3). Two parallel rays say nothing of the depth along them: the ridge keeps the
     result finite (and enormous, so that such points are rejected by their uncertainty)."""
     ridge = 1e-12 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
