@@ -12,14 +12,17 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import sparse
 
 from colmap_tco import _pycolmap
 from colmap_tco._pycolmap import Floats, Ints, Model, Registered
 from colmap_tco.errors import InputError
 from colmap_tco.tracks import Tracks, image_jacobian, inverse, skew
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 log = logging.getLogger(__name__)
 
@@ -81,6 +84,8 @@ def _reduced(tracks: Tracks, entries: list[Registered], unit: float) -> Floats:
     derivative by the rotation ω of the camera, exp(ω) R, is that by the point X in the camera's frame times
     −[X]×, and by the centre the negative of that by the point in the world.
     """
+    from scipy import sparse
+
     cameras, seen, at = [], [], []
     for entry in entries:
         local = _local(tracks, entry)
@@ -104,6 +109,8 @@ def _reduced(tracks: Tracks, entries: list[Registered], unit: float) -> Floats:
 
 def _stacked(blocks: Floats, column: Ints, columns: int) -> sparse.bsr_array:
     """Blocks (N, 2, K) one below the other, each in its column (N,) of blocks."""
+    from scipy import sparse
+
     count = np.arange(len(blocks) + 1)
     shape = (2 * len(blocks), blocks.shape[2] * columns)
     return sparse.bsr_array((blocks, column, count), shape=shape)
