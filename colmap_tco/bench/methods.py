@@ -49,7 +49,7 @@ def check_row(network: Backbone, row: Row) -> None:
     if network.uses_cameras and not {"pose", "intrinsics"} <= set(row.priors):
         raise InputError(
             f"{where}: {network.name} takes poses and intrinsics as input and predicts neither; it can run "
-            "tco, no-compatibility, rank=, radius=, heads, surfels, steps= and noise= with --priors "
+            "tco, adapt-only, no-compatibility, rank=, radius=, heads, surfels, steps= and noise= with --priors "
             "pose,intrinsics (steps=0 is the network alone)"
         )
     if network.uses_cameras and row.name == "raw-depth":
@@ -197,7 +197,7 @@ def _with_heads(network: Any) -> Backbone:
 
 
 def _heads(config: TCOConfig, network: Backbone) -> TCOConfig:
-    """Heads trained in full at a tenth of the rate, and adapters on the rest of the decoder alone."""
+    """Heads trained in full at a rate of their own, and adapters on the rest of the decoder at its rate."""
     decoder = network.decoder()
     if isinstance(network, _WithHeads):
         chosen = tuple(name for name in select(decoder, config.lora_targets) if name.startswith("blocks."))
@@ -206,9 +206,4 @@ def _heads(config: TCOConfig, network: Backbone) -> TCOConfig:
         chosen = config.lora_targets
         found = [name for name, _ in decoder.named_modules() if name.split(".")[-1].endswith("head")]
         unfrozen = tuple(found) or (list(select(decoder, ("*",)))[-1],)
-    return replace(
-        config,
-        rate=config.rate / 10,
-        lora_targets=chosen,
-        ablation=replace(config.ablation, unfrozen=unfrozen),
-    )
+    return replace(config, lora_targets=chosen, ablation=replace(config.ablation, unfrozen=unfrozen))
