@@ -49,13 +49,26 @@ def check_row(network: Backbone, row: Row) -> None:
     if network.uses_cameras and not {"pose", "intrinsics"} <= set(row.priors):
         raise InputError(
             f"{where}: {network.name} takes poses and intrinsics as input and predicts neither; it can run "
-            "tco, adapt-only, no-compatibility, rank=, radius=, heads, surfels, steps= and noise= with --priors "
-            "pose,intrinsics (steps=0 is the network alone)"
+            "tco, adapt-only, no-compatibility, rank=, radius=, heads, surfels, steps= and noise= with "
+            "--priors pose,intrinsics (steps=0 is the network alone)"
         )
     if network.uses_cameras and row.name == "raw-depth":
         raise InputError(f"{where}: {network.name} takes the cameras as input; its own depths are steps=0")
     if row.cameras and not {"pose", "intrinsics"} <= set(row.priors):
         raise InputError(f"{where} takes the prior cameras: give --priors pose,intrinsics")
+
+
+def check_settings(row: Row, config: TCOConfig) -> None:
+    """Whether the settings of a run, as the row changes them, make use of its priors.
+
+    Raises:
+        InputError: they do not.
+    """
+    config = row.config(config)
+    if "depth" in row.priors and config.steps and not config.depth_weight:
+        raise InputError(
+            f"--rows {row.name} has depths as priors, which count for nothing: give --depth_weight"
+        )
 
 
 def reconstruct(
@@ -72,14 +85,12 @@ def reconstruct(
         seed: of the noise and of the optimisation.
 
     Raises:
-        InputError: the network cannot run the row.
+        InputError: the network cannot run the row, or its priors count for nothing.
+        ValueError: there is nothing to optimise, or the cameras of the scene determine no scale.
     """
     check_row(network, row)
+    check_settings(row, config)
     config, cameras = row.config(config), row.noise.cameras(scene.cameras, seed)
-    if "depth" in row.priors and config.steps and not config.depth_weight:
-        raise InputError(
-            f"--rows {row.name} has depths as priors, which count for nothing: give --depth_weight"
-        )
     backbone = _with_heads(network) if row.heads else network
     if row.heads:
         config = _heads(config, backbone)
@@ -115,7 +126,7 @@ def _with_cameras(
     """The network's depths in the prior cameras; then, for surfels, optimised without the network."""
     first = optimize(network, views, Priors(), replace(config, steps=0)).prediction
     scaled = rescaled(cameras, first.cameras)
-    if not row.surfels:
+    if not row.surfels or len(views) == 1:  # one view has no other that its surfels could be compared with
         return _result(Outcome(replace(first, cameras=scaled), scaled))
     none = views.images.new_zeros(0)
     empty = SparseDepth(none.reshape(0, 2), none, none, none.long())

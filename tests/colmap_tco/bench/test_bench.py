@@ -153,6 +153,57 @@ def test_a_scene_that_fails_has_a_reason_and_the_others_figures(config: BenchCon
     assert table(config, "scenes")["base, staircase"]["acc_mean"]
 
 
+def test_one_frame_has_no_other_to_be_compared_with(config: BenchConfig, tmp_path: Path) -> None:
+    """NRGBD's thin_geometry has one frame in the sparse setting: every row ends, and none stops the others."""
+    layouts.nrgbd(tmp_path / "one", 1)
+    rows = ("raw-depth", "surfels", "tco", "pose", "noise=3/0.05/0.05")
+    bench(replace(config, root=tmp_path / "one", rows=rows), Progress())
+    found = {row: tuple(figures(config, row, "kitchen").values()) for row in rows}
+    assert found["surfels"] == pytest.approx(found["raw-depth"], rel=1e-9)
+
+
+def test_a_row_that_cannot_end_is_listed_and_the_others_go_on(config: BenchConfig) -> None:
+    """Without adapters there is nothing that the steps could change."""
+    nothing = replace(config, rows=("base", "tco"), scenes=("kitchen",))
+    with pytest.raises(PartlyDoneError, match=r"1 scenes without figures \(tco, kitchen: there is nothing"):
+        bench(replace(nothing, tco=TCOConfig(steps=1, lora_targets=())), Progress())
+    scenes = table(config, "scenes")
+    assert scenes["base, kitchen"]["acc_mean"] and "nothing to optimise" in scenes["tco, kitchen"]["failed"]
+
+
+def test_other_weights_of_the_same_size_or_another_root_are_other_settings(
+    config: BenchConfig, rooms: Path, tmp_path: Path
+) -> None:
+    one = replace(config, rows=("base",), scenes=("kitchen",))
+    mine = tmp_path / "mine.safetensors"
+    shutil.copyfile(config.network.weights, mine)
+    one = replace(one, network=replace(one.network, weights=str(mine)))
+    bench(one, Progress())
+    other = bytearray(mine.read_bytes())
+    other[-1] ^= 1
+    mine.write_bytes(other)
+    with pytest.raises(InputError, match=r"made with other settings \(weights\)"):
+        bench(one, Progress())
+    other[-1] ^= 1
+    mine.write_bytes(other)
+    shutil.copytree(rooms, tmp_path / "copy")
+    with pytest.raises(InputError, match=r"made with other settings \(root\)"):
+        bench(replace(one, root=tmp_path / "copy"), Progress())
+    bench(one, Progress())
+
+
+def test_the_tables_have_what_earlier_calls_made_alike(config: BenchConfig) -> None:
+    bench(replace(config, rows=("raw-depth",), scenes=("staircase",)), Progress())
+    bench(replace(config, rows=("steps=0",), image_width=42), Progress())
+    done = bench(replace(config, rows=("base",), scenes=("kitchen",)), Progress())
+    assert tuple(table(config)) == ("base", "raw-depth")
+    assert set(table(config, "scenes")) == {"base, kitchen", "raw-depth, staircase"}
+    assert "| raw-depth |" in done.text and "steps=0" not in done.text
+    bench(replace(config, rows=("raw-depth",), scenes=("kitchen",)), Progress())
+    assert tuple(table(config)) == ("raw-depth", "base")
+    assert [line["scenes"] for line in table(config).values()] == ["2", "1"]
+
+
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
