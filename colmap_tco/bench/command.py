@@ -15,6 +15,7 @@ from colmap_tco.bench.rows import MEANING, Row, parse_rows
 from colmap_tco.bench.schedules import published as published_schedule
 from colmap_tco.errors import InputError, PartlyDoneError
 from colmap_tco.progress import Progress
+from colmap_tco.published import Network
 from tco.config import knob
 from tco.options import TCOConfig
 
@@ -259,22 +260,27 @@ def _scene(run: _Run, network: Backbone, scene: str, rows: Sequence[Row]) -> lis
 
     if not rows:
         return []
-    usual = WIDTHS.get(run.config.dataset, WIDTH)
-    width = run.config.image_width or (run.chosen.network.image_size if network.uses_cameras else usual)
+    wide = width(run.config, run.chosen.network)
     frames: list[int] = []
     with TemporaryDirectory(prefix="colmap-tco-bench-") as folder:
         try:
             frames = run.choice.frames(run.dataset.count(scene))
             read = run.dataset.read(scene, frames)
             prepared: Prepared = (
-                triangulated(read, width, network.stride, Path(folder), run.config.seed)
+                triangulated(read, wide, network.stride, Path(folder), run.config.seed)
                 if network.uses_cameras
-                else resized(read, width, network.stride)
+                else resized(read, wide, network.stride)
             )
         except InputError as error:
             log.warning("%s: %s", scene, error)
             return [Result(row.name, scene, {}, 0.0, len(frames), str(error)) for row in rows]
     return [_row(run, network, scene, prepared, row) for row in rows]
+
+
+def width(config: BenchConfig, network: Network) -> int:
+    """Width in pixels of the pictures that a network sees."""
+    own = network.image_size if network.kind in TAKE_CAMERAS else WIDTHS.get(config.dataset, WIDTH)
+    return config.image_width or own
 
 
 def _row(run: _Run, network: Backbone, scene: str, prepared: Any, row: Row) -> Result:

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from colmap_tco.backbones import NetworkConfig
-from colmap_tco.bench.command import BenchConfig, bench
+from colmap_tco.bench.command import DATASETS, BenchConfig, bench, width
 from colmap_tco.errors import InputError, PartlyDoneError
 from colmap_tco.progress import Progress
+from colmap_tco.published import NETWORKS
 from tco.backbones.checkpoints import save
 from tco.options import TCOConfig
 from tests.colmap_tco.datasets import layouts
@@ -154,7 +155,7 @@ def test_a_scene_that_fails_has_a_reason_and_the_others_figures(config: BenchCon
 
 
 def test_one_frame_has_no_other_to_be_compared_with(config: BenchConfig, tmp_path: Path) -> None:
-    """NRGBD's thin_geometry has one frame in the sparse setting: every row ends, and none stops the others."""
+    """NRGBD's thin_geometry has one frame in the sparse setting; no row of it stops the others."""
     layouts.nrgbd(tmp_path / "one", 1)
     rows = ("raw-depth", "surfels", "tco", "pose", "noise=3/0.05/0.05")
     bench(replace(config, root=tmp_path / "one", rows=rows), Progress())
@@ -245,6 +246,15 @@ def test_poses_from_depths_on_scannet(config: BenchConfig, tmp_path: Path) -> No
         bench(replace(scannet, rows=("tco",), published_settings=False, overwrite=True), Progress())
     with pytest.raises(InputError, match="poses are measured"):
         bench(replace(scannet, rows=("pose",)), Progress())
+
+
+def test_pictures_are_as_wide_as_in_the_published_evaluations() -> None:
+    """ScanNet's are loaded 512 wide and cut to whole patches of 14 pixels, the others 518 wide."""
+    for name in ("vggt", "pi3", "da3"):
+        wide = {dataset: width(BenchConfig(dataset=dataset), NETWORKS[name]) for dataset in DATASETS}
+        assert wide == {"eth3d": 518, "dtu": 518, "7scenes": 518, "nrgbd": 518, "scannet": 512 // 14 * 14}
+    assert width(BenchConfig(dataset="scannet"), NETWORKS["sweep"]) == 256
+    assert width(BenchConfig(dataset="scannet", image_width=70), NETWORKS["vggt"]) == 70
 
 
 @pytest.mark.slow
