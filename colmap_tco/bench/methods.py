@@ -101,12 +101,12 @@ def reconstruct(
         return _result(optimize(backbone, views, priors, config, seed), scene.unit)
     if row.cameras:
         return _with_cameras(backbone, views, cameras.to(device), row, config, seed)
-    priors = _held(scene, cameras, row).to(device) if config.steps else Priors()
+    priors = held_priors(scene, cameras, row).to(device) if config.steps else Priors()
     return _result(optimize(backbone, views, priors, config, seed))
 
 
-def _held(scene: Prepared, cameras: Cameras, row: Row) -> Priors:
-    """The priors of a row as penalties: cameras with the published weights, or depths."""
+def held_priors(scene: Prepared, cameras: Cameras, row: Row) -> Priors:
+    """The priors of a row as penalties: prior cameras (V) with the published weights, or depths."""
     weights = CameraPenalties()
     # One view has no relative pose; the published penalties are 0 then.
     posed = "pose" in row.priors and len(cameras) > 1
