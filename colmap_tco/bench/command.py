@@ -103,6 +103,8 @@ class _Run:
     setting: str
     choice: Choice
     scenes: tuple[str, ...]
+    there: tuple[str, ...]
+    """All scenes of the folder, of which ``scenes`` are to be run."""
     chosen: Selected
     folder: Path
     made_with: Mapping[str, str]
@@ -153,7 +155,7 @@ def _open(config: BenchConfig) -> _Run:
         )
     setting, frames = choice(config.dataset, config.setting)
     dataset = open_dataset(config.dataset, config.root, config.as_published)
-    there = dataset.scenes()
+    there = tuple(dataset.scenes())
     lacking = [scene for scene in config.scenes if scene not in there]
     if lacking:
         raise InputError(f"--scenes {lacking[0]}: {config.root} has {', '.join(there)}")
@@ -163,7 +165,8 @@ def _open(config: BenchConfig) -> _Run:
         "version": versions()["colmap-tco"],
     }
     folder = config.output / f"{config.dataset}-{setting}-{chosen.network.name}"
-    return _Run(config, dataset, setting, frames, config.scenes or tuple(there), chosen, folder, made_with)
+    wanted = config.scenes or there
+    return _Run(config, dataset, setting, frames, wanted, there, chosen, folder, made_with)
 
 
 def _priors(config: BenchConfig) -> tuple[str, ...]:
@@ -236,9 +239,9 @@ def _with_earlier(run: _Run, results: Mapping[str, Sequence[Result]]) -> dict[st
             continue
         if earlier is not None:
             found.setdefault(name, {})[scene] = earlier
-    listed, scenes = list(MEANING), run.dataset.scenes()
+    listed = list(MEANING)
     names = sorted(found, key=lambda name: -1 if name in results else listed.index(_kind(name)))
-    return {name: [found[name][scene] for scene in scenes if scene in found[name]] for name in names}
+    return {name: [found[name][scene] for scene in run.there if scene in found[name]] for name in names}
 
 
 def _check_rows(network: Backbone, rows: Sequence[Row], config: TCOConfig) -> None:
