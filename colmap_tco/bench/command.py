@@ -191,19 +191,11 @@ def _check_priors(dataset: str, rows: Sequence[Row]) -> None:
 
 def _results(run: _Run, rows: Sequence[Row], progress: Progress) -> dict[str, list[Result]]:
     """Row → results of its scenes; a scene is prepared once for all its rows."""
-    from colmap_tco.bench.store import read_result, write_result
+    from colmap_tco.bench.store import write_result
 
-    found: dict[str, dict[str, Result]] = {row.name: {} for row in rows}
-    todo: list[tuple[str, list[Row]]] = []
-    for scene in run.scenes:
-        for row in rows:
-            kept = read_result(run.folder, row.name, scene, _settings(run, row, scene), run.config.overwrite)
-            if kept is not None and kept.failed:
-                log.info("%s, %s: failed before (%s), tried again", row.name, scene, kept.failed)
-            elif kept is not None:
-                found[row.name][scene] = kept
-        todo.append((scene, [row for row in rows if scene not in found[row.name]]))
-    open_rows = sum(len(left) for _, left in todo)
+    found = _finished(run, rows)
+    todo = {scene: [row for row in rows if scene not in found[row.name]] for scene in run.scenes}
+    open_rows = sum(len(left) for left in todo.values())
     kept_rows = len(rows) * len(run.scenes) - open_rows
     if kept_rows:
         log.info("%s: %d results are kept, %d are to be made", run.folder, kept_rows, open_rows)
@@ -211,12 +203,27 @@ def _results(run: _Run, rows: Sequence[Row], progress: Progress) -> dict[str, li
     if open_rows:
         network = load(run.chosen)
         _check_rows(network, rows, _tco(run))
-        for scene, left in todo:
+        for scene, left in todo.items():
             for result in _scene(run, network, scene, left):
                 write_result(run.folder, _settings(run, _named(rows, result.row), scene), result)
                 found[result.row][scene] = result
                 progress.advance()
     return {name: [by_scene[scene] for scene in run.scenes] for name, by_scene in found.items()}
+
+
+def _finished(run: _Run, rows: Sequence[Row]) -> dict[str, dict[str, Result]]:
+    """Row → scene → what was made before and has figures."""
+    from colmap_tco.bench.store import read_result
+
+    found: dict[str, dict[str, Result]] = {row.name: {} for row in rows}
+    for scene in run.scenes:
+        for row in rows:
+            kept = read_result(run.folder, row.name, scene, _settings(run, row, scene), run.config.overwrite)
+            if kept is not None and kept.failed:
+                log.info("%s, %s: failed before (%s), tried again", row.name, scene, kept.failed)
+            elif kept is not None:
+                found[row.name][scene] = kept
+    return found
 
 
 def _with_earlier(run: _Run, results: Mapping[str, Sequence[Result]]) -> dict[str, list[Result]]:
