@@ -1,21 +1,25 @@
-"""The paper's ablations and our switches on the real sets: what each changes in accuracy and in seconds.
+"""The paper's ablations and our switches on real and rendered sets: what each changes, in how many seconds.
 
-    python -m benchmarks.ablations [--output docs/ablations.md] [--only rank,heads]
+    python -m benchmarks.ablations [--sets kitchen hills] [--output docs/ablations.md] [--only rank,heads]
 
-Every row is the default configuration with one thing changed. What is the head or the last part of the
-network is taken from its structure, so that any backbone can be put in.
+Every row is the default configuration with one thing changed, on the network alone: depths are polished where
+a row says so. Modules that are trained in full have a tenth of the adapters' rate. What is the head or the
+last part of the network is taken from its structure, so that any backbone can be put in.
 """
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Iterator
 from dataclasses import replace
 
-import torch
+import numpy as np
 from torch import nn
 
-from benchmarks.real import arguments, load, median_error, publish, within
+from benchmarks.real import RealSet, arguments, load, median_error, within
+from benchmarks.tables import cell, paragraph, publish, runs, weights_told
+from tco.backbones.base import Backbone
 from tco.backbones.weights import EMBEDDED, load_sweep
 from tco.lora import select
 from tco.optimize import optimize
@@ -27,7 +31,7 @@ def variants(decoder: nn.Module, plain: TCOConfig) -> Iterator[tuple[str, TCOCon
     layers = list(select(decoder, ("*",)))
     last = layers[-1].split(".")[0]
     heads = [name for name, _ in decoder.named_modules() if name.split(".")[-1].endswith("head")]
-    slow = replace(plain, rate=plain.rate / 10)
+    slow = plain.rate / 10
 
     def ablation(config: TCOConfig = plain, **changes: object) -> TCOConfig:
         return replace(config, ablation=AblationConfig(**changes))  # type: ignore[arg-type]
@@ -44,8 +48,11 @@ def variants(decoder: nn.Module, plain: TCOConfig) -> Iterator[tuple[str, TCOCon
     for rank in (1, 16):
         yield f"rank {rank}", replace(plain, lora_rank=rank)
     yield f"adapters on the last part only ({last})", replace(plain, lora_targets=(f"{last}.*",))
-    yield "heads trained in full, too", ablation(slow, unfrozen=tuple(heads or layers[-1:]))
-    yield "decoder trained in full, no adapters", ablation(replace(slow, lora_targets=()), unfrozen=("*",))
+    yield "heads trained in full, too", ablation(unfrozen=tuple(heads or layers[-1:]), unfrozen_rate=slow)
+    yield (
+        "decoder trained in full, no adapters",
+        ablation(replace(plain, lora_targets=()), unfrozen=("*",), unfrozen_rate=slow),
+    )
     yield (
         "depths of pixels instead of the network",
         ablation(replace(plain, lora_targets=()), free_depth=True, free_rate=2e-3),
@@ -69,44 +76,50 @@ def variants(decoder: nn.Module, plain: TCOConfig) -> Iterator[tuple[str, TCOCon
     yield "stop by hidden points", replace(plain, stop_after=plain.steps // 3)
 
 
-def main() -> None:
+def measured(network: Backbone, real: RealSet, config: TCOConfig, seeds: int) -> str:
+    """Share of the measured pixels within 5 %, median error and seconds of CPU, over the seeds."""
+    shares, errors, seconds = [], [], []
+    for seed in range(seeds if config.steps else 1):
+        start = time.process_time()
+        prediction = optimize(network, real.views, real.given, config, seed).prediction
+        seconds.append(time.process_time() - start)
+        shares.append(within(prediction, real.truth))
+        errors.append(100 * median_error(prediction, real.truth))
+    return f"{cell(shares, 3)}, {cell(errors, 2)} %, {np.mean(seconds):.0f} s"
+
+
+def parser() -> argparse.ArgumentParser:
     """Command line."""
     parser = arguments(__doc__ or "")
     parser.add_argument("--only", default="", help="parts of names of variants, separated by commas")
-    parser.add_argument("--seeds", type=int, default=1, help="runs of each; their mean and spread are shown")
-    args = parser.parse_args()
-    network = load_sweep(args.weights or EMBEDDED)
+    parser.add_argument("--seeds", type=int, default=1, help="runs of each")
+    return parser
+
+
+def main() -> None:
+    """Measure and publish, row by row."""
+    args = parser().parse_args()
+    weights = args.weights or EMBEDDED
+    network = load_sweep(weights)
     sets = [load(name, args.size, args.views) for name in args.sets]
     wanted = [word for word in args.only.split(",") if word]
-    lines = [
-        "# Ablations\n",
-        f"`python -m benchmarks.ablations --steps {args.steps} --seeds {args.seeds}`, sets "
-        f"{', '.join(args.sets)}: {args.views or 'all'} views of {args.size} pixels, {args.steps} "
-        f"steps on the network, means of {args.seeds} run(s). Share of measured pixels within 5 %, its "
-        "standard deviation over the runs, median error, seconds of CPU.\n",
-        "| | " + " | ".join(args.sets) + " |",
-        "|---" * (len(sets) + 1) + "|",
-    ]
-    for name, config in variants(
-        network.decoder(), TCOConfig(steps=args.steps, polish=PolishConfig(polish_looks=0))
-    ):
+    about = paragraph(
+        f"`python -m benchmarks.ablations --steps {args.steps} --seeds {args.seeds}`: "
+        f"{weights_told(weights)}, {args.views or 'all'} views of {args.size} pixels, {args.steps} steps on "
+        f"the network, {runs(args.seeds)}. Share of the measured pixels within 5 %, median error, seconds of "
+        "CPU. Depths are those of each view alone; what they gain from each other is in `docs/consensus.md`. "
+        "Modules that are trained in full have a tenth of the adapters' rate."
+    )
+    head = "| | " + " | ".join(args.sets) + " |\n" + "|---" * (len(sets) + 1) + "|\n"
+    text = f"# Ablations\n\n{about}\n{head}"
+    plain = TCOConfig(steps=args.steps, polish=PolishConfig(polish_looks=0))
+    for name, config in variants(network.decoder(), plain):
         if wanted and not any(word in name for word in wanted):
             continue
-        cells = []
-        for real in sets:
-            figures = []
-            for seed in range(args.seeds):
-                start = time.process_time()
-                prediction = optimize(network, real.views, real.given, config, seed).prediction
-                seconds = time.process_time() - start
-                figures.append(
-                    (within(prediction, real.truth), median_error(prediction, real.truth), seconds)
-                )
-            share, error, seconds = torch.tensor(figures).mean(0).tolist()
-            spread = f" ± {torch.tensor(figures)[:, 0].std():.3f}" if args.seeds > 1 else ""
-            cells.append(f"{share:.3f}{spread} {100 * error:.2f} % {seconds:.0f} s")
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-        publish("\n".join(lines) + "\n", args.output) if args.output else publish(lines[-1] + "\n", None)
+        cells = [measured(network, real, config, args.seeds) for real in sets]
+        line = f"| {name} | " + " | ".join(cells) + " |\n"
+        text += line
+        publish(text if args.output else line, args.output, args.part)
 
 
 if __name__ == "__main__":

@@ -13,13 +13,15 @@ A second table sets the standard error, by how far apart the views were (``error
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.real import arguments, load, publish
+from benchmarks.real import arguments, load
+from benchmarks.tables import paragraph, plot_beside, publish, weights_told
 from tco.backbones.sweep import ERROR_UNIT
 from tco.backbones.weights import EMBEDDED, load_sweep
 from tco.consensus import agreed
@@ -75,12 +77,18 @@ def plot(curves: dict[str, list[Row]], path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def main() -> None:
+def parser() -> argparse.ArgumentParser:
     """Command line."""
     parser = arguments(__doc__ or "")
     parser.set_defaults(steps=TCOConfig().steps, size=256, views=0)
-    args = parser.parse_args()
-    network = load_sweep(args.weights or EMBEDDED)
+    return parser
+
+
+def main() -> None:
+    """Measure and publish."""
+    args = parser().parse_args()
+    weights = args.weights or EMBEDDED
+    network = load_sweep(weights)
     curves, apart = {}, {}
     for name in args.sets:
         real = load(name, args.size, args.views)
@@ -93,17 +101,18 @@ def main() -> None:
         curves[name] = classes(predicted.numpy(), error.to(torch.float64).numpy())
         spread = together.error[known].to(torch.float64).numpy()
         apart[name] = classes(spread, error.to(torch.float64).numpy(), APART)
-    text = (
-        f"# Calibration of the confidence\n\n`python -m benchmarks.calibration --steps {args.steps}`: "
-        f"{args.size} pixels, {args.views or 'all'} views.\n"
+    text = "# Calibration of the confidence\n\n" + paragraph(
+        f"`python -m benchmarks.calibration --steps {args.steps}`: {weights_told(weights)}, {args.size} "
+        f"pixels, {args.views or 'all'} views."
     )
     if args.output is not None:
-        plot(curves, args.output.with_suffix(".png"))
-        text += f"\n![predicted against actual error]({args.output.with_suffix('.png').name})\n"
+        picture = plot_beside(args.output, args.part)
+        plot(curves, picture)
+        text += f"\n![predicted against actual error]({picture.name})\n"
     for name, rows in curves.items():
         text += f"\n## {name}\n\nOff by a factor of {2 ** gap(rows):.2f} on average.\n\n"
         text += table("predicted", rows) + "\n" + table("standard error", apart[name])
-    publish(text, args.output)
+    publish(text, args.output, args.part)
 
 
 def table(what: str, rows: list[Row]) -> str:

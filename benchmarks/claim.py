@@ -1,14 +1,17 @@
 """The paper's claim at our scale: what each prior and the compatibility of views bring a network.
 
     python -m benchmarks.claim [--backbone sweep] [--seeds 3] [--output docs/claim.md]
+    python -m benchmarks.claim --sets hills knots walk temple --part rendered --output docs/claim.md
     python -m benchmarks.claim --backbone mini --weights runs/gpu/out/weights.safetensors
 
 The claim (arXiv 2604.03878): held to what is known of the cameras and to its own views' agreement for some
 steps at test time, a network reconstructs better than it does alone. Rows are those of ``colmap-tco bench``
-(``colmap_tco/bench/rows.py``), run by the same code, on the shared real sets. A network that predicts cameras
-runs all of them, with the settings of the paper's scripts for 7-Scenes, Kinect sequences of rooms as these
-sets are. One that takes cameras as input cannot do without them: its first row is the network alone with both
-priors, and its settings are those of ``densify``.
+(``colmap_tco/bench/rows.py``), run by the same code, on the shared real sets or rendered scenes. A network
+that predicts cameras runs all of them, with the settings of the paper's scripts for 7-Scenes, Kinect
+sequences of rooms as the real sets are. One that takes cameras as input cannot do without them: its first row
+is the network alone with both priors, and its settings are those of ``densify``, which refines depths after
+the steps on the network. ``no-compatibility`` does not; what comparing views brings is its distance to
+``adapt-only``.
 
 Columns: ``d5``, share of the measured pixels whose depth is within 5 % after one scale for all views, the
 median ratio; ``acc`` and ``comp``, means of the distances of points to the sensor's and back, millimetres,
@@ -19,14 +22,13 @@ A ± is half of the 95 % interval of the mean over seeds (Student's t).
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
-from benchmarks.real import RealSet, arguments, load, publish
+from benchmarks.real import RealSet, arguments, load
+from benchmarks.tables import cell, paragraph, publish, runs, weights_told
 from colmap_tco.backbones import NetworkConfig, Selected, select, suited
 from colmap_tco.backbones import load as load_network
 from colmap_tco.bench.command import TAKE_CAMERAS
@@ -43,9 +45,13 @@ from tco.options import TCOConfig
 
 BOTH = ("pose", "intrinsics")
 CURVE = ("steps=5", "steps=10", "steps=20", "steps=80")
+ABLATIONS = (
+    "rank=1", "rank=16", "radius=0.05", "radius=2", "heads", "surfels",
+    "noise=1/0.01/0.01", "noise=3/0.05/0.05", "noise=5/0.1/0.1",
+)  # fmt: skip
 ROWS = {
-    False: ("base", "pose", "intrinsics", "tco", "no-compatibility", *CURVE),
-    True: ("steps=0", "tco", "no-compatibility", *CURVE),
+    False: ("base", "raw-depth", "pose", "intrinsics", "tco", "no-compatibility", *CURVE, *ABLATIONS),
+    True: ("steps=0", "tco", "adapt-only", "no-compatibility", *CURVE, *ABLATIONS),
 }
 """Whether a network takes cameras as input → its rows, the network alone first."""
 
@@ -80,38 +86,22 @@ def figures(made: Reconstruction, scene: Prepared, own_cameras: bool) -> Figures
     return found
 
 
-def interval(values: Sequence[float]) -> tuple[float, float]:
-    """Mean, and half the width of its 95 % interval by Student's t; not a number for a single value."""
-    from scipy.stats import t
-
-    n = len(values)
-    if n < 2:
-        return float(np.mean(values)), math.nan
-    return float(np.mean(values)), float(t.ppf(0.975, n - 1) * np.std(values, ddof=1) / math.sqrt(n))
-
-
-def cell(values: Sequence[float], digits: int) -> str:
-    """Mean ± half of the interval; one value alone has no interval."""
-    mean, half = interval(values)
-    return f"{mean:.{digits}f}" + ("" if math.isnan(half) else f" ± {half:.{digits}f}")
-
-
-def line(row: str, runs: Sequence[Sequence[Figures]], base: Sequence[Sequence[Figures]]) -> str:
+def line(row: str, ours: Sequence[Sequence[Figures]], base: Sequence[Sequence[Figures]]) -> str:
     """A row of the table.
 
     Args:
         row: its name.
-        runs: figures of each set and seed.
+        ours: figures of each set and seed.
         base: those of the network alone.
     """
     parts = []
-    for of_set in runs:
+    for of_set in ours:
         digits = {"d5": 3, "AUC": 3, "acc": 1, "comp": 1}
         parts += [cell([run[name] for run in of_set], digits[name]) for name in of_set[0]]
-    each = zip(*runs, strict=True), zip(*base, strict=True)
+    each = zip(*ours, strict=True), zip(*base, strict=True)
     gains = [
-        float(np.mean([a["d5"] - b["d5"] for a, b in zip(ours, alone, strict=True)]))
-        for ours, alone in zip(*each, strict=True)
+        float(np.mean([a["d5"] - b["d5"] for a, b in zip(adapted, alone, strict=True)]))
+        for adapted, alone in zip(*each, strict=True)
     ]
     return f"| {row} | " + " | ".join(parts) + f" | {cell(gains, 3)} |"
 
@@ -134,7 +124,7 @@ def settings(chosen: Selected) -> TCOConfig:
     return published("7scenes", TCOConfig())
 
 
-def options() -> argparse.Namespace:
+def parser() -> argparse.ArgumentParser:
     """Command line."""
     parser = arguments(__doc__ or "")
     parser.set_defaults(steps=0)
@@ -142,7 +132,7 @@ def options() -> argparse.Namespace:
     parser.add_argument("--device", default="auto")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--rows", nargs="+", default=None, help="as colmap-tco bench has them; first: alone")
-    return parser.parse_args()
+    return parser
 
 
 def table(
@@ -155,15 +145,15 @@ def table(
     lines = [f"| | {head} | gain in d5 |", "|---" * (2 + len(sets) * len(columns)) + "|"]
     base: list[list[Figures]] = []
     for row in rows:
-        runs = [measured(network, scene, row, config, seeds) for scene in scenes]
-        base = base or runs
-        lines.append(line(row.name, runs, base))
+        ours = [measured(network, scene, row, config, seeds) for scene in scenes]
+        base = base or ours
+        lines.append(line(row.name, ours, base))
     return lines
 
 
 def main() -> None:
     """Measure and publish."""
-    args = options()
+    args = parser().parse_args()
     weights = str(args.weights) if args.weights else ""
     try:
         chosen = select(NetworkConfig(backbone=args.backbone, weights=weights, device=args.device))
@@ -178,12 +168,14 @@ def main() -> None:
         lines = table(network, sets, rows, config, args.seeds)
     except DensifyError as error:
         raise SystemExit(str(error)) from error
-    about = (
-        f"# What priors and compatibility bring {args.backbone}\n\n`python -m benchmarks.claim`: weights "
-        f"{Path(chosen.weights).name}, {args.views or 'all'} views of {args.size} pixels, {config.steps} "
-        f"steps at {config.rate:g} where a row does not say otherwise, {args.seeds} seeds.\n\n"
+    head = f"# What priors and compatibility bring {args.backbone}\n\n"
+    about = paragraph(
+        f"`python -m benchmarks.claim`: {weights_told(chosen.weights)}, {args.views or 'all'} views of "
+        f"{args.size} pixels, {config.steps} steps at {config.rate:g} where a row does not say otherwise, "
+        f"{runs(args.seeds)}. d5 is taken after one scale for all views; acc and comp are millimetres. `gain "
+        "in d5` is over the first row, paired by seed, mean of the sets."
     )
-    publish(about + "\n".join(lines) + "\n", args.output)
+    publish(head + about + "\n" + "\n".join(lines) + "\n", args.output, args.part)
 
 
 if __name__ == "__main__":

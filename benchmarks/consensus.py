@@ -8,19 +8,18 @@ the consensus are varied on the same depths. Rendered sets (``benchmarks/rendere
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
-from benchmarks.real import SETS, RealSet, arguments, load, load_from, median_error, publish, within
-from benchmarks.rendered import SCENES, made
+from benchmarks.real import SETS, RealSet, arguments, load, median_error, within
+from benchmarks.rendered import SCENES
+from benchmarks.tables import paragraph, publish, weights_told
 from tco.backbones.weights import EMBEDDED, load_sweep
 from tco.consensus import agreed
 from tco.optimize import Outcome, optimize
 from tco.options import ConsensusConfig, TCOConfig
-
-RENDERED = Path("runs/rendered")
 
 
 def variants() -> Iterator[tuple[str, ConsensusConfig]]:
@@ -48,22 +47,24 @@ def cell(real: RealSet, outcome: Outcome, config: ConsensusConfig) -> str:
     return f"{near:.3f} {close:.3f} {100 * median_error(depths, real.truth):.2f} % {seconds:.1f} s"
 
 
-def main() -> None:
+def parser() -> argparse.ArgumentParser:
     """Command line."""
     parser = arguments(__doc__ or "", (*SETS, *SCENES))
     parser.set_defaults(size=256, views=0, steps=TCOConfig().steps)
-    args = parser.parse_args()
-    network = load_sweep(args.weights or EMBEDDED)
-    sets = [
-        load(name, args.size, args.views)
-        if name in SETS
-        else load_from(made(name, RENDERED), name, args.size, args.views)
-        for name in args.sets
-    ]
+    return parser
+
+
+def main() -> None:
+    """Measure and publish."""
+    args = parser().parse_args()
+    weights = args.weights or EMBEDDED
+    network = load_sweep(weights)
+    sets = [load(name, args.size, args.views) for name in args.sets]
     head = "| | " + " | ".join(args.sets) + " |\n" + "|---" * (len(sets) + 1) + "|\n"
-    text = (
-        f"# Consensus\n\n`python -m benchmarks.consensus`: {args.size} pixels, {args.views or 'all'} views. "
-        "Shares of the measured pixels within 2 and 5 %, median error, seconds of CPU of the consensus.\n"
+    text = "# Consensus\n\n" + paragraph(
+        f"`python -m benchmarks.consensus`: {weights_told(weights)}, {args.size} pixels, "
+        f"{args.views or 'all'} views. Shares of the measured pixels within 2 and 5 %, median error, seconds "
+        "of CPU of the consensus (`tco/consensus.py`, `docs/method.md`)."
     )
     for steps in (0, args.steps):
         outcomes = [optimize(network, real.views, real.given, TCOConfig(steps=steps)) for real in sets]
@@ -71,7 +72,7 @@ def main() -> None:
         for name, config in variants():
             cells = [cell(real, outcome, config) for real, outcome in zip(sets, outcomes, strict=True)]
             text += f"| {name} | " + " | ".join(cells) + " |\n"
-    publish(text, args.output)
+    publish(text, args.output, args.part)
 
 
 if __name__ == "__main__":

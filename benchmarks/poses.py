@@ -1,6 +1,6 @@
 """Poses from depth: how far rough poses come back when the sensor's depths are known.
 
-    python -m benchmarks.poses [--sets kitchen office livingroom] [--seeds 0 1] [--output docs/poses-table.md]
+    python -m benchmarks.poses [--sets kitchen office livingroom] [--seeds 0 1] [--output docs/poses.md]
 
 COLMAP's poses, in metres, are turned about a random axis by a normal angle (3°) and moved in a random
 direction by a normal length (5 % of the mean distance of the centres from their middle). They go into
@@ -20,7 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.real import SETS, SHARED, publish
+from benchmarks.real import SETS, SHARED
+from benchmarks.tables import publish, to_file
 from colmap_tco import _pycolmap
 from colmap_tco.evaluation.sources import read_cameras, read_tum, world_from_cam
 from colmap_tco.evaluation.trajectory import TrajectoryFigures, trajectory_figures
@@ -105,7 +106,7 @@ def row(name: str, seed: int | None, config: PoseConfig) -> str:
     return f"| {name} | {1000 * unit:.0f} | {start} | " + " | ".join(pairs) + f" | {seconds:.0f} |"
 
 
-def main() -> None:
+def parser() -> argparse.ArgumentParser:
     """Command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--sets", nargs="+", default=list(SETS), choices=SETS)
@@ -113,8 +114,13 @@ def main() -> None:
     parser.add_argument("--exact", action="store_true", help="start from COLMAP's own poses, too")
     parser.add_argument("--photometric", type=float, default=PoseConfig().photometric)
     parser.add_argument("--geometric", type=float, default=PoseConfig().geometric)
-    parser.add_argument("--output", type=Path, default=None, help="Markdown file to write, else the terminal")
-    args = parser.parse_args()
+    to_file(parser)
+    return parser
+
+
+def main() -> None:
+    """Measure and publish, row by row."""
+    args = parser().parse_args()
     _pycolmap.load()
     config = replace(PoseConfig(), photometric=args.photometric, geometric=args.geometric)
     lines = [
@@ -125,7 +131,7 @@ def main() -> None:
     for name in args.sets:
         for seed in [*args.seeds, *([None] if args.exact else [])]:
             lines.append(row(name, seed, config))
-            publish("\n".join(lines) + "\n" if args.output else lines[-1] + "\n", args.output)
+            publish("\n".join(lines) + "\n" if args.output else lines[-1] + "\n", args.output, args.part)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Densify the shared real sets and score them against their sensors, beside what else one could run.
 
-``python -m benchmarks.quality --steps 0 5 --baselines interp patchmatch`` prints a Markdown table.
+``python -m benchmarks.quality --steps 0 5 --baselines interp patchmatch`` prints a Markdown table;
+``--output docs/quality.md`` writes it, and ``--part`` says which of that file it is.
 ``--sets`` also takes the rendered scenes of ``benchmarks/rendered.py``, which are scored against their truth.
 Workspaces are copied to ``--work`` first; the shared sets are only read.
 """
@@ -19,11 +20,25 @@ from pathlib import Path
 from typing import NamedTuple
 
 from benchmarks.rendered import SCENES, made
+from benchmarks.tables import FIRST, paragraph, publish, to_file, weights_told
+from colmap_tco.published import NETWORKS
+from colmap_tco.weights import located
 from tco.options import TCOConfig
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 SETS = ("kitchen", "office", "livingroom")
 COLUMNS = ("cover", "med", "d2", "d5", "f5", "acc", "comp", "points")
+LEGEND = (
+    "Pictures of 256 pixels unless an option says otherwise. PatchMatch is a CPU implementation at half the "
+    "resolution of the pictures (`score.py --baseline patchmatch --half`). Depth figures are of the maps as "
+    "written, after the views were asked together (`docs/consensus.md` has them of each view alone); clouds "
+    "are made of what each view found alone, and of the other in their gaps. cover: share of the measured "
+    "pixels with a depth. med: median relative error. d2, d5: share of **all** measured pixels within 2 and "
+    "5 %; a hole counts as wrong. f5: F-score of the cloud at 5 cm; acc, comp: median distance of its points "
+    "to the truth, and of the truth to it, in metres. s: seconds of the whole command, from starting Python "
+    "to the page of the report."
+)
+"""What the table says of itself."""
 
 
 class Done(NamedTuple):
@@ -113,33 +128,45 @@ def densified(name: str, steps: int, work: Path, rest: list[str]) -> tuple[dict[
     return scored(source(name, work), "--dense", str(kept))[0], done.seconds, done.peak
 
 
-def main() -> None:
-    """Command line; other options are handed to densify."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def parser() -> argparse.ArgumentParser:
+    """Command line; what it does not know is handed to densify."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0], allow_abbrev=False)
     parser.add_argument("--sets", nargs="+", default=list(SETS), choices=[*SETS, *SCENES])
     parser.add_argument("--steps", nargs="+", type=int, default=[0, TCOConfig().steps])
     parser.add_argument("--baselines", nargs="*", default=["interp"], help="interp, patchmatch")
     parser.add_argument("--work", type=Path, default=Path("runs/quality"))
-    args, rest = parser.parse_known_args()
+    to_file(parser)
+    return parser
+
+
+def main() -> None:
+    """Measure and publish, row by row."""
+    args, rest = parser().parse_known_args()
     args.work.mkdir(parents=True, exist_ok=True)
-    out = sys.stdout
-    out.write(
-        "| set | method | "
-        + " | ".join(COLUMNS)
-        + " | s | s / view | GiB |\n"
-        + "|---" * (len(COLUMNS) + 5)
-        + "|\n"
+    head = (
+        "| set | method | " + " | ".join(COLUMNS) + " | s | s / view | GiB |\n" + "|---" * (len(COLUMNS) + 5)
     )
+    told = " ".join(["--steps", *map(str, args.steps), *rest])
+    made = f"`python -m benchmarks.quality {told}`: {weights_told(located(NETWORKS['sweep']))}."
+    about = paragraph(f"{made} {LEGEND}" if args.part == FIRST else made)
+    text = f"# Quality, measured\n\n{about}\n{head}|\n"
+    publish(text if args.output else f"{head}|\n", args.output, args.part)
+
+    def add(line: str) -> None:
+        nonlocal text
+        text += line + "\n"
+        publish(text if args.output else line + "\n", args.output, args.part)
+        sys.stdout.flush()
+
     for name in args.sets:
         views = len(list((source(name, args.work) / "images").iterdir()))
         for baseline in args.baselines:
             half = ["--half"] if baseline == "patchmatch" else []
             figures, peak = scored(source(name, args.work), "--baseline", baseline, *half)
-            out.write(row(name, baseline, figures, figures["seconds"], peak, views) + "\n")
+            add(row(name, baseline, figures, figures["seconds"], peak, views))
         for steps in args.steps:
             figures, seconds, peak = densified(name, steps, args.work, rest)
-            out.write(row(name, f"colmap-tco, {steps} steps", figures, seconds, peak, views) + "\n")
-            out.flush()
+            add(row(name, f"colmap-tco, {steps} steps", figures, seconds, peak, views))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,8 @@
-"""The shared real sets as the optimisation sees them, with the sensor's depth in the same pixels and unit."""
+"""Sets as the optimisation sees them, with the true depth in the same pixels and unit.
+
+The shared real sets have that of a sensor; the rendered scenes (``benchmarks/rendered.py``) are made where
+they are asked for and not there yet.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.rendered import SCENES, made
+from benchmarks.tables import to_file
 from colmap_tco.priors import PriorSet, build_priors, chunk_frame
 from colmap_tco.tracks import read_tracks
 from colmap_tco.views import ViewConfig, batch, make_views, original_from_network
@@ -21,6 +27,8 @@ from tco.types import Prediction, Priors, Views
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 SETS = ("kitchen", "office", "livingroom")
+RENDERED = Path("runs/rendered")
+"""Where rendered scenes are, or are made."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +54,10 @@ def load(name: str, size: int, count: int = 0, stride: int = 16) -> RealSet:
     """The first ``count`` views of a set (0: all), longer sides ``size`` pixels, multiples of ``stride``.
 
     Raises:
-        SystemExit: the sets are not beside this checkout.
+        SystemExit: the shared sets are not beside this checkout.
     """
+    if name in SCENES:
+        return load_from(made(name, RENDERED), name, size, count, stride)
     root = SHARED / name
     if not root.is_dir():
         sys.exit(f"{root} is not there: this measurement needs the shared real sets")
@@ -90,21 +100,12 @@ def median_error(prediction: Prediction, truth: Tensor) -> float:
 
 
 def arguments(description: str, sets: tuple[str, ...] = SETS) -> argparse.ArgumentParser:
-    """A parser with what all measurements share: sets, size, views, steps, weights and where to write."""
+    """A parser with what all measurements share; ``sets`` are those that are taken if none are named."""
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
-    parser.add_argument("--sets", nargs="+", default=list(sets), choices=sets)
+    parser.add_argument("--sets", nargs="+", default=list(sets), choices=(*SETS, *SCENES))
     parser.add_argument("--size", type=int, default=192, help="longer side of the views, pixels")
     parser.add_argument("--views", type=int, default=8, help="views of each set; 0 is all")
     parser.add_argument("--steps", type=int, default=24)
     parser.add_argument("--weights", type=Path, default=None, help="file of weights instead of the package's")
-    parser.add_argument("--output", type=Path, default=None, help="Markdown file to write, else the terminal")
+    to_file(parser)
     return parser
-
-
-def publish(text: str, output: Path | None) -> None:
-    """Write a result to a file, or show it."""
-    if output is None:
-        sys.stdout.write(text)
-        return
-    output.parent.mkdir(parents=True, exist_ok=True)
-    output.write_text(text, encoding="utf-8")

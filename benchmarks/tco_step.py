@@ -21,7 +21,8 @@ from typing import Any
 
 import torch
 
-from benchmarks.real import RealSet, arguments, load, publish, within
+from benchmarks.real import RealSet, arguments, load, within
+from benchmarks.tables import paragraph, publish, weights_told
 from benchmarks.uncached import Uncached
 from tco.backbones.base import Backbone
 from tco.backbones.weights import EMBEDDED, load_sweep
@@ -137,28 +138,33 @@ def table(name: str, published: Curve, ours: Curve) -> str:
     return "\n".join(lines) + "\n\n"
 
 
-def main() -> None:
+def parser() -> argparse.ArgumentParser:
     """Command line."""
     parser = arguments(__doc__ or "", ("livingroom",))
-    parser.set_defaults(sets=["livingroom"])
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument(
         "--cpu_time", action="store_true", help="seconds of the CPU, where others use it, too"
     )
-    args = parser.parse_args()
-    text = (
-        f"# Published schedule and ours\n\n`python -m benchmarks.tco_step`: {args.views or 'all'} views of "
-        f"{args.size} pixels, {args.steps} steps, {args.threads} threads, the same objective and network. "
-        f"Seconds are those of {'the CPU' if args.cpu_time else 'a clock'}; on other machines they differ, "
-        "and their ratio should not. Memory is the peak of the process.\n\n"
+    return parser
+
+
+def main() -> None:
+    """Measure and publish."""
+    args = parser().parse_args()
+    text = "# Published schedule and ours\n\n" + paragraph(
+        f"`python -m benchmarks.tco_step`: {weights_told(args.weights or EMBEDDED)}, "
+        f"{args.views or 'all'} views of {args.size} pixels, {args.steps} steps, {args.threads} threads, the "
+        f"same objective and network. Seconds are those of {'the CPU' if args.cpu_time else 'a clock'}; on "
+        "other machines they differ, and their ratio should not. Memory is the peak of the process."
     )
+    text += "\n"
     for name in args.sets:
         curves = []
         for reference in (True, False):
             with ProcessPoolExecutor(1, get_context("spawn")) as pool:
                 curves.append(pool.submit(measure, name, args, reference).result())
         text += table(name, *curves)
-    publish(text, args.output)
+    publish(text, args.output, args.part)
 
 
 if __name__ == "__main__":

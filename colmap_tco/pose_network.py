@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,20 +33,23 @@ SETTINGS = TCOConfig(photometric_weight=0.0, geometric_weight=1.0, depth_weight=
 
 
 def predicted(
-    folder: Path, known: tuple[Mapping[str, Path], float, RoughConfig], config: NetworkConfig,
-    schedule: tuple[int, int], progress: Progress,
+    folder: Path, names: Sequence[str], known: tuple[Mapping[str, Path], float, RoughConfig],
+    config: NetworkConfig, schedule: tuple[int, int], progress: Progress,
 ) -> Rough:  # fmt: skip
     """Adapt a network to the measured depths and take its poses, in their unit.
 
+    All images go through the network; those without depth take part in nothing but the views' compatibility.
+
     Args:
         folder: of the images.
+        names: of the images, those without depth among them.
         known: name → depth file, the unit of PNG values, and the camera, if the user named one.
         config: which network.
         schedule: steps, and the seed.
         progress: of the run.
 
     Raises:
-        InputError: the network takes cameras instead of finding them.
+        InputError: the network takes cameras instead of finding them, or an image cannot be read.
         MissingError: no such device or weights.
     """
     files, unit, rough = known
@@ -58,7 +61,7 @@ def predicted(
             "rough poses with --rough (a COLMAP model or a TUM trajectory), or use a network that finds "
             "poses: colmap-tco weights fetch vggt, then --backbone vggt"
         )
-    entries = with_camera(folder, sorted(files), rough) if rough.camera_params else _guessed(folder, files)
+    entries = with_camera(folder, names, rough) if rough.camera_params else _guessed(folder, names)
     workspace = Workspace(folder, folder, folder, None, tuple(entries), ())
     settings = ViewConfig(max_image_size=chosen.network.image_size)
     views, skipped = make_views(workspace, settings, chosen.network.stride)
@@ -104,7 +107,7 @@ def find(
     return poses, outcome.cameras.K.double().cpu().numpy()
 
 
-def _guessed(folder: Path, names: Mapping[str, Path]) -> list[Registered]:
+def _guessed(folder: Path, names: Sequence[str]) -> list[Registered]:
     """The images with cameras that have their size and a middle; the focal length is a placeholder."""
     entries = []
     for number, name in enumerate(sorted(names), 1):

@@ -113,6 +113,7 @@ def poses(images: Path, config: PosesConfig, progress: Progress) -> Trajectory:
     found = _found(views, frame, scale, done, levels[-1])
     figures = {
         "images": len(views),
+        "without_depth": blind,
         "not_moved": [view.name for view, moved in zip(views, done.moved, strict=True) if not moved],
         "skipped": skipped,
         "rough": rough.origin,
@@ -157,7 +158,7 @@ def _rough(
     from colmap_tco.pose_network import predicted
 
     known = (files, config.depth_unit, config.rough)
-    return predicted(folder, known, config.network, (config.steps, config.seed), progress)
+    return predicted(folder, names, known, config.network, (config.steps, config.seed), progress)
 
 
 def _usable(folder: Path, rough: Rough) -> tuple[Rough, dict[str, str]]:

@@ -169,8 +169,12 @@ class _Run:
 
     def prepare(self, parameters: Sequence[torch.nn.Parameter]) -> None:
         """Optimiser over the adapters and the camera corrections; remember the start as the best state."""
-        c = self.config
-        groups = [(list(parameters), c.rate), (list(self.free.parameters()), c.ablation.free_rate)]
+        c, own = self.config, {id(p) for p in self.backbone.decoder().parameters()}
+        groups = [
+            ([p for p in parameters if id(p) not in own], c.rate),
+            ([p for p in parameters if id(p) in own], c.ablation.unfrozen_rate),
+            (list(self.free.parameters()), c.ablation.free_rate),
+        ]
         if self.corrections is not None:
             groups.append((list(self.corrections.parameters()), c.camera_rate))
         self.parameters = [p for params, _ in groups for p in params]

@@ -17,6 +17,9 @@ class AblationConfig:
     unfrozen: tuple[str, ...] = knob(
         (), "name patterns of the decoder's modules that are trained in full beside the adapters; * is all"
     )
+    unfrozen_rate: float = knob(
+        1e-5, "learning rate of these modules (Adam), as the published code has it for heads"
+    )
     radius_factor: float = knob(
         0.5, "radius of a surfel in steps between neighbouring points; the paper tries 0.05 to 5"
     )

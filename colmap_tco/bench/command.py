@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,6 +15,7 @@ from colmap_tco.bench.rows import MEANING, Row, parse_rows
 from colmap_tco.bench.schedules import published as published_schedule
 from colmap_tco.errors import InputError, PartlyDoneError
 from colmap_tco.progress import Progress
+from colmap_tco.published import Network
 from tco.config import knob
 from tco.options import TCOConfig
 
@@ -29,6 +30,11 @@ TAKE_CAMERAS = ("sweep",)
 """Kinds of networks whose cameras are input, for which TCO's settings were not made."""
 
 DATASETS = ("eth3d", "dtu", "7scenes", "nrgbd", "scannet")
+
+WIDTH = 518
+"""Of the pictures that networks see in the published evaluations, pixels."""
+WIDTHS = {"scannet": 504}
+"""Dataset → their width where it is another: 512, cut to whole patches of 14 pixels."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +57,9 @@ class BenchConfig:
     )
     output: Path = knob(Path("bench"), "folder of the results; finished scenes in it are kept", alias="-o")
     image_width: int = knob(
-        0, "width of the pictures that the network sees, pixels; 0: 518, as published, and 256 for sweep"
+        0,
+        "width of the pictures that the network sees, pixels; 0: as published, 504 for scannet and 518 for "
+        "the others, and 256 for sweep",
     )
     published_settings: bool = knob(
         True,
@@ -95,14 +103,19 @@ class _Run:
     setting: str
     choice: Choice
     scenes: tuple[str, ...]
+    there: tuple[str, ...]
+    """All scenes of the folder, of which ``scenes`` are to be run."""
     chosen: Selected
     folder: Path
+    made_with: Mapping[str, str]
+    """Version of this package and fingerprint of the weights, which decide results, too."""
 
 
 def bench(config: BenchConfig, progress: Progress) -> Benched:
     """Run the rows over the scenes; finished ones are kept from before.
 
-    A scene that cannot be reconstructed or compared gets no figures, and the others go on.
+    A scene that cannot be reconstructed or compared gets no figures, and the others go on. The tables also
+    have the rows and scenes that earlier calls left in the folder, if this one would make them alike.
 
     Raises:
         InputError: a dataset, setting, scene, row or prior that does not exist or does not go together, a
@@ -120,7 +133,8 @@ def bench(config: BenchConfig, progress: Progress) -> Benched:
     results = _results(run, rows, progress)
     columns = COLUMNS[config.dataset]
     known = published(config.dataset, run.setting)
-    table = write_tables(run.folder, results, columns, _about(run, rows), known)
+    every = _with_earlier(run, results)
+    table = write_tables(run.folder, every, columns, _about(run, every), known)
     failed = [result for row in results.values() for result in row if result.failed]
     if failed:
         told = "; ".join(f"{r.row}, {r.scene}: {r.failed}" for r in failed[:3])
@@ -130,6 +144,8 @@ def bench(config: BenchConfig, progress: Progress) -> Benched:
 
 def _open(config: BenchConfig) -> _Run:
     from colmap_tco.datasets import choice, open_dataset
+    from colmap_tco.report import versions
+    from colmap_tco.resume import fingerprint
 
     if config.dataset not in DATASETS:
         raise InputError(f"--dataset '{config.dataset}': there are {', '.join(DATASETS)}")
@@ -139,13 +155,18 @@ def _open(config: BenchConfig) -> _Run:
         )
     setting, frames = choice(config.dataset, config.setting)
     dataset = open_dataset(config.dataset, config.root, config.as_published)
-    there = dataset.scenes()
+    there = tuple(dataset.scenes())
     lacking = [scene for scene in config.scenes if scene not in there]
     if lacking:
         raise InputError(f"--scenes {lacking[0]}: {config.root} has {', '.join(there)}")
     chosen = select(config.network)
+    made_with = {
+        "weights": f"{chosen.weights.name}, {fingerprint({}, [chosen.weights], ())}",
+        "version": versions()["colmap-tco"],
+    }
     folder = config.output / f"{config.dataset}-{setting}-{chosen.network.name}"
-    return _Run(config, dataset, setting, frames, config.scenes or tuple(there), chosen, folder)
+    wanted = config.scenes or there
+    return _Run(config, dataset, setting, frames, wanted, there, chosen, folder, made_with)
 
 
 def _priors(config: BenchConfig) -> tuple[str, ...]:
@@ -170,25 +191,19 @@ def _check_priors(dataset: str, rows: Sequence[Row]) -> None:
 
 def _results(run: _Run, rows: Sequence[Row], progress: Progress) -> dict[str, list[Result]]:
     """Row → results of its scenes; a scene is prepared once for all its rows."""
-    from colmap_tco.bench.store import read_result, write_result
+    from colmap_tco.bench.store import write_result
 
-    found: dict[str, dict[str, Result]] = {row.name: {} for row in rows}
-    todo: list[tuple[str, list[Row]]] = []
-    for scene in run.scenes:
-        for row in rows:
-            kept = read_result(run.folder, row.name, scene, _settings(run, row, scene), run.config.overwrite)
-            if kept is not None:
-                found[row.name][scene] = kept
-        todo.append((scene, [row for row in rows if scene not in found[row.name]]))
-    open_rows = sum(len(left) for _, left in todo)
+    found = _finished(run, rows)
+    todo = {scene: [row for row in rows if scene not in found[row.name]] for scene in run.scenes}
+    open_rows = sum(len(left) for left in todo.values())
     kept_rows = len(rows) * len(run.scenes) - open_rows
     if kept_rows:
         log.info("%s: %d results are kept, %d are to be made", run.folder, kept_rows, open_rows)
     progress.stage("rows and scenes", open_rows)
     if open_rows:
         network = load(run.chosen)
-        _check_rows(network, rows)
-        for scene, left in todo:
+        _check_rows(network, rows, _tco(run))
+        for scene, left in todo.items():
             for result in _scene(run, network, scene, left):
                 write_result(run.folder, _settings(run, _named(rows, result.row), scene), result)
                 found[result.row][scene] = result
@@ -196,11 +211,52 @@ def _results(run: _Run, rows: Sequence[Row], progress: Progress) -> dict[str, li
     return {name: [by_scene[scene] for scene in run.scenes] for name, by_scene in found.items()}
 
 
-def _check_rows(network: Backbone, rows: Sequence[Row]) -> None:
-    from colmap_tco.bench.methods import check_row
+def _finished(run: _Run, rows: Sequence[Row]) -> dict[str, dict[str, Result]]:
+    """Row → scene → what was made before and has figures."""
+    from colmap_tco.bench.store import read_result
+
+    found: dict[str, dict[str, Result]] = {row.name: {} for row in rows}
+    for scene in run.scenes:
+        for row in rows:
+            kept = read_result(run.folder, row.name, scene, _settings(run, row, scene), run.config.overwrite)
+            if kept is not None and kept.failed:
+                log.info("%s, %s: failed before (%s), tried again", row.name, scene, kept.failed)
+            elif kept is not None:
+                found[row.name][scene] = kept
+    return found
+
+
+def _with_earlier(run: _Run, results: Mapping[str, Sequence[Result]]) -> dict[str, list[Result]]:
+    """The results, and those in the folder that were not asked for and have the settings of this run.
+
+    Rows that were asked for come first, the others in the order in which they are listed; scenes are in that
+    of the dataset.
+    """
+    from colmap_tco.bench.store import read_result, stored
+
+    found = {name: {result.scene: result for result in of_row} for name, of_row in results.items()}
+    for name, scene in stored(run.folder):
+        if scene in found.get(name, {}):
+            continue
+        try:
+            (row,) = parse_rows([name], _priors(run.config))
+            earlier = read_result(run.folder, name, scene, _settings(run, row, scene))
+        except InputError as error:
+            log.info("%s, %s is left out of the tables: %s", name, scene, error)
+            continue
+        if earlier is not None:
+            found.setdefault(name, {})[scene] = earlier
+    listed = list(MEANING)
+    names = sorted(found, key=lambda name: -1 if name in results else listed.index(_kind(name)))
+    return {name: [found[name][scene] for scene in run.there if scene in found[name]] for name in names}
+
+
+def _check_rows(network: Backbone, rows: Sequence[Row], config: TCOConfig) -> None:
+    from colmap_tco.bench.methods import check_row, check_settings
 
     for row in rows:
         check_row(network, row)
+        check_settings(row, config)
 
 
 def _named(rows: Sequence[Row], name: str) -> Row:
@@ -214,21 +270,27 @@ def _scene(run: _Run, network: Backbone, scene: str, rows: Sequence[Row]) -> lis
 
     if not rows:
         return []
-    width = run.config.image_width or (run.chosen.network.image_size if network.uses_cameras else 518)
+    wide = width(run.config, run.chosen.network)
     frames: list[int] = []
     with TemporaryDirectory(prefix="colmap-tco-bench-") as folder:
         try:
             frames = run.choice.frames(run.dataset.count(scene))
             read = run.dataset.read(scene, frames)
             prepared: Prepared = (
-                triangulated(read, width, network.stride, Path(folder), run.config.seed)
+                triangulated(read, wide, network.stride, Path(folder), run.config.seed)
                 if network.uses_cameras
-                else resized(read, width, network.stride)
+                else resized(read, wide, network.stride)
             )
         except InputError as error:
             log.warning("%s: %s", scene, error)
             return [Result(row.name, scene, {}, 0.0, len(frames), str(error)) for row in rows]
     return [_row(run, network, scene, prepared, row) for row in rows]
+
+
+def width(config: BenchConfig, network: Network) -> int:
+    """Width in pixels of the pictures that a network sees."""
+    own = network.image_size if network.kind in TAKE_CAMERAS else WIDTHS.get(config.dataset, WIDTH)
+    return config.image_width or own
 
 
 def _row(run: _Run, network: Backbone, scene: str, prepared: Any, row: Row) -> Result:
@@ -238,16 +300,16 @@ def _row(run: _Run, network: Backbone, scene: str, prepared: Any, row: Row) -> R
     from colmap_tco.bench.store import Result
 
     config, views = _tco(run), len(prepared.views)
-    start = time.perf_counter()
-    made = reconstruct(network, prepared, row, config, run.chosen.device, run.config.seed)
-    seconds = time.perf_counter() - start
+    start, seconds = time.perf_counter(), 0.0
     try:
+        made = reconstruct(network, prepared, row, config, run.chosen.device, run.config.seed)
+        seconds = time.perf_counter() - start
         if run.config.dataset == "scannet":
             figures = pose_figures(made.world_from_cam, prepared.world_from_cam)
         else:
             per_metre = UNITS.get(run.config.dataset, 1.0)
             figures = point_figures(made.points, prepared.points, prepared.known, per_metre)
-    except InputError as error:
+    except (InputError, ValueError) as error:
         log.warning("%s, %s: %s", row.name, scene, error)
         return Result(row.name, scene, {}, seconds, views, str(error))
     told = ", ".join(f"{name} {value:.4f}" for name, value in figures.items())
@@ -265,14 +327,16 @@ def _tco(run: _Run) -> TCOConfig:
 
 def _settings(run: _Run, row: Row, scene: str) -> Mapping[str, Any]:
     """All that decides a result, as JSON can hold it."""
-    c, weights = run.config, run.chosen.weights
+    c = run.config
+    assert c.root is not None
     return {
+        **run.made_with,
         "dataset": c.dataset,
+        "root": str(c.root.resolve()),
         "setting": run.setting,
         "as_published": c.as_published,
         "scene": scene,
         "backbone": run.chosen.network.name,
-        "weights": f"{weights.name}, {weights.stat().st_size} bytes",
         "image_width": c.image_width,
         "seed": c.seed,
         "row": row.name,
@@ -281,11 +345,11 @@ def _settings(run: _Run, row: Row, scene: str) -> Mapping[str, Any]:
     }
 
 
-def _about(run: _Run, rows: Sequence[Row]) -> list[str]:
+def _about(run: _Run, rows: Iterable[str]) -> list[str]:
     """What the table's head says."""
     config, unit = _tco(run), "millimetres" if run.config.dataset == "dtu" else "metres"
     what = "Poses, in metres and degrees" if run.config.dataset == "scannet" else f"Points, in {unit}"
-    told = "; ".join(f"{row.name}: {MEANING.get(row.name, MEANING.get(_kind(row.name), ''))}" for row in rows)
+    told = "; ".join(f"{name}: {MEANING[_kind(name)]}" for name in rows)
     return [
         f"# {run.config.dataset}, {run.setting}, {run.chosen.network.name}",
         f"{what}; means over scenes. Weights: {run.chosen.weights.name}. Priors: "

@@ -49,13 +49,26 @@ def check_row(network: Backbone, row: Row) -> None:
     if network.uses_cameras and not {"pose", "intrinsics"} <= set(row.priors):
         raise InputError(
             f"{where}: {network.name} takes poses and intrinsics as input and predicts neither; it can run "
-            "tco, no-compatibility, rank=, radius=, heads, surfels, steps= and noise= with --priors "
-            "pose,intrinsics (steps=0 is the network alone)"
+            "tco, adapt-only, no-compatibility, rank=, radius=, heads, surfels, steps= and noise= with "
+            "--priors pose,intrinsics (steps=0 is the network alone)"
         )
     if network.uses_cameras and row.name == "raw-depth":
         raise InputError(f"{where}: {network.name} takes the cameras as input; its own depths are steps=0")
     if row.cameras and not {"pose", "intrinsics"} <= set(row.priors):
         raise InputError(f"{where} takes the prior cameras: give --priors pose,intrinsics")
+
+
+def check_settings(row: Row, config: TCOConfig) -> None:
+    """Whether the settings of a run, as the row changes them, make use of its priors.
+
+    Raises:
+        InputError: they do not.
+    """
+    config = row.config(config)
+    if "depth" in row.priors and config.steps and not config.depth_weight:
+        raise InputError(
+            f"--rows {row.name} has depths as priors, which count for nothing: give --depth_weight"
+        )
 
 
 def reconstruct(
@@ -72,14 +85,12 @@ def reconstruct(
         seed: of the noise and of the optimisation.
 
     Raises:
-        InputError: the network cannot run the row.
+        InputError: the network cannot run the row, or its priors count for nothing.
+        ValueError: there is nothing to optimise, or the cameras of the scene determine no scale.
     """
     check_row(network, row)
+    check_settings(row, config)
     config, cameras = row.config(config), row.noise.cameras(scene.cameras, seed)
-    if "depth" in row.priors and config.steps and not config.depth_weight:
-        raise InputError(
-            f"--rows {row.name} has depths as priors, which count for nothing: give --depth_weight"
-        )
     backbone = _with_heads(network) if row.heads else network
     if row.heads:
         config = _heads(config, backbone)
@@ -90,12 +101,12 @@ def reconstruct(
         return _result(optimize(backbone, views, priors, config, seed), scene.unit)
     if row.cameras:
         return _with_cameras(backbone, views, cameras.to(device), row, config, seed)
-    priors = _held(scene, cameras, row).to(device) if config.steps else Priors()
+    priors = held_priors(scene, cameras, row).to(device) if config.steps else Priors()
     return _result(optimize(backbone, views, priors, config, seed))
 
 
-def _held(scene: Prepared, cameras: Cameras, row: Row) -> Priors:
-    """The priors of a row as penalties: cameras with the published weights, or depths."""
+def held_priors(scene: Prepared, cameras: Cameras, row: Row) -> Priors:
+    """The priors of a row as penalties: prior cameras (V) with the published weights, or depths."""
     weights = CameraPenalties()
     # One view has no relative pose; the published penalties are 0 then.
     posed = "pose" in row.priors and len(cameras) > 1
@@ -115,7 +126,7 @@ def _with_cameras(
     """The network's depths in the prior cameras; then, for surfels, optimised without the network."""
     first = optimize(network, views, Priors(), replace(config, steps=0)).prediction
     scaled = rescaled(cameras, first.cameras)
-    if not row.surfels:
+    if not row.surfels or len(views) == 1:  # one view has no other that its surfels could be compared with
         return _result(Outcome(replace(first, cameras=scaled), scaled))
     none = views.images.new_zeros(0)
     empty = SparseDepth(none.reshape(0, 2), none, none, none.long())
@@ -197,7 +208,7 @@ def _with_heads(network: Any) -> Backbone:
 
 
 def _heads(config: TCOConfig, network: Backbone) -> TCOConfig:
-    """Heads trained in full at a tenth of the rate, and adapters on the rest of the decoder alone."""
+    """Heads trained in full at a rate of their own, and adapters on the rest of the decoder at its rate."""
     decoder = network.decoder()
     if isinstance(network, _WithHeads):
         chosen = tuple(name for name in select(decoder, config.lora_targets) if name.startswith("blocks."))
@@ -206,9 +217,4 @@ def _heads(config: TCOConfig, network: Backbone) -> TCOConfig:
         chosen = config.lora_targets
         found = [name for name, _ in decoder.named_modules() if name.split(".")[-1].endswith("head")]
         unfrozen = tuple(found) or (list(select(decoder, ("*",)))[-1],)
-    return replace(
-        config,
-        rate=config.rate / 10,
-        lora_targets=chosen,
-        ablation=replace(config.ablation, unfrozen=unfrozen),
-    )
+    return replace(config, lora_targets=chosen, ablation=replace(config.ablation, unfrozen=unfrozen))

@@ -28,8 +28,14 @@ class Noise:
             parts.append(f"focal {100 * self.focal:g} %")
         return ", ".join(parts) or "none"
 
-    def __call__(self, priors: Priors, seed: int) -> Priors:
-        """Priors with cameras that are wrong by this much, and know it."""
+    def __call__(self, priors: Priors, seed: int, stated: float = 1.0) -> Priors:
+        """Priors with cameras that are wrong by this much, and know it; points and overlap stay as they are.
+
+        Args:
+            priors: with cameras and their standard deviations, to which those of the noise are added.
+            seed: of the noise; see :meth:`cameras`.
+            stated: standard deviations that are told over those that are drawn from.
+        """
         import torch
 
         cameras = priors.cameras
@@ -37,19 +43,20 @@ class Noise:
         assert priors.centre_sigma is not None and priors.focal_sigma is not None
         unit = _unit(cameras)
         # A normal length in a random direction has a third of its variance along each axis.
-        third = math.sqrt(1 / 3)
+        third = stated * math.sqrt(1 / 3)
         return replace(
             priors,
             cameras=self.cameras(cameras, seed),
             rotation_sigma=priors.rotation_sigma.hypot(torch.tensor(third * math.radians(self.rotation))),
             centre_sigma=priors.centre_sigma.hypot(torch.tensor(third * self.translation * unit)),
-            focal_sigma=priors.focal_sigma.hypot(torch.tensor(self.focal)),
+            focal_sigma=priors.focal_sigma.hypot(torch.tensor(stated * self.focal)),
         )
 
     def cameras(self, cameras: Cameras, seed: int) -> Cameras:
         """Every camera of V turned about a random axis by a normal angle, its centre moved in a random
         direction by a normal length, in parts of the mean distance of the centres from their middle, and its
-        focal length multiplied by the exponential of a normal number."""
+        focal length multiplied by the exponential of a normal number. Noises of one seed differ in their
+        sizes alone: axes, directions and normal numbers are the same."""
         import torch
 
         from tco.geometry import rigid, so3_exp

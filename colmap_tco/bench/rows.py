@@ -19,7 +19,8 @@ MEANING = {
     "pose": "optimised with the poses alone",
     "intrinsics": "optimised with the intrinsics alone",
     "depth": "optimised with the depths alone",
-    "no-compatibility": "as tco, without comparing views: the priors' penalties alone",
+    "adapt-only": "as tco, without refining depths after the steps on the network",
+    "no-compatibility": "as adapt-only, without comparing views: the priors' penalties alone",
     "rank=N": "as tco, with adapters of this rank; the paper has 1, 4 and 16",
     "radius=X": "as tco, with surfels of this radius, in steps between points; the paper tries 0.05 to 5",
     "heads": "as tco, with the network's heads trained in full beside the adapters",
@@ -61,8 +62,8 @@ class Row:
 
 
 _FORWARD = (("steps", 0),)
-_SILENT = (("photometric_weight", 0.0), ("geometric_weight", 0.0), ("consistency_weight", 0.0),
-           ("polish", PolishConfig(polish_looks=0)))  # fmt: skip
+_ADAPT = (("polish", PolishConfig(polish_looks=0)),)
+_SILENT = (("photometric_weight", 0.0), ("geometric_weight", 0.0), ("consistency_weight", 0.0), *_ADAPT)
 _SURFELS = (("free_depth", True), ("free_surfels", True))
 
 
@@ -91,6 +92,7 @@ def _parse(name: str, priors: tuple[str, ...]) -> Row:
         "base": Row(name, (), changes=_FORWARD),
         "raw-depth": replace(plain, cameras=True, changes=_FORWARD),
         "tco": plain,
+        "adapt-only": replace(plain, changes=_ADAPT),
         "no-compatibility": replace(plain, changes=_SILENT),
         "heads": replace(plain, heads=True),
         "surfels": replace(

@@ -61,7 +61,7 @@ def _plain(name: str) -> str:
 def read_result(
     folder: Path, row: str, scene: str, settings: Mapping[str, Any], overwrite: bool = False
 ) -> Result | None:
-    """The finished result of these settings, or None if there is none, or it failed, or is to be replaced.
+    """The result of these settings, failed or not, or None if there is none, or it is to be replaced.
 
     Raises:
         InputError: there is one of other settings, or the file is damaged, and ``overwrite`` is not given.
@@ -80,10 +80,19 @@ def read_result(
             f"{path} was made with other settings ({', '.join(changed) or 'of another version'}); give "
             "--overwrite to replace it, or another --output to keep it"
         )
-    if result.failed:
-        log.info("%s, %s: failed before (%s), tried again", row, scene, result.failed)
-        return None
     return result
+
+
+def stored(folder: Path) -> list[tuple[str, str]]:
+    """Rows and scenes of all results in the folder, whatever their settings; what is none is left out."""
+    found = []
+    for path in sorted(folder.glob("*/*.json")):
+        try:
+            saved = json.loads(path.read_text("utf-8"))["result"]
+            found.append((saved["row"], saved["scene"]))
+        except (ValueError, KeyError, TypeError) as error:
+            log.warning("%s: no result of this command (%s)", path, error)
+    return found
 
 
 def write_result(folder: Path, settings: Mapping[str, Any], result: Result) -> None:

@@ -15,7 +15,8 @@ first 270), which π³ and TCO read:
 
 The frames of a scene are those 90 in both cases. Colour and depth differ in size and focal length; in the
 export both cameras are at the same place (extrinsic_color is the identity), so that a depth is looked up
-along the ray of its pixel.
+along the ray of its pixel. Depths count between 1 mm and 10 m, both excluded, as in TCO's
+``configs/evaluation/relpose-distance.yaml`` (``min_valid_depth``, ``max_valid_depth``).
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from pathlib import Path
 import numpy as np
 
 from colmap_tco.datasets.base import (
+    Depth,
     Floats,
     Frame,
     InFolder,
@@ -44,6 +46,8 @@ from colmap_tco.datasets.base import (
 from colmap_tco.errors import InputError
 
 COUNT, EVERY = 90, 3
+VALID = 1e-3, 10.0
+"""Metres between which a depth counts."""
 
 REMEDY = "export the scene's .sens with ScanNet's SensReader, see docs/bench.md"
 
@@ -95,10 +99,16 @@ class ScanNet(InFolder):
             size = image_size(path)
             _check(K, size, root, path)
             folder = "depth_90" if prepared else "depth"
-            load = partial(read_depth_png, root / folder / f"{path.stem}.png", REMEDY)
+            load = partial(_depth, root / folder / f"{path.stem}.png")
             found.append(Frame(path.stem, path, size, pose, K, load, depth_K))
         mesh = root / f"{scene}_vh_clean_2.ply"
         return Scene(scene, tuple(found), mesh if mesh.exists() else None)
+
+
+def _depth(path: Path) -> Depth:
+    """Metres, 0 where there is none or it does not count."""
+    depth, least, most = read_depth_png(path, REMEDY), np.float32(VALID[0]), np.float32(VALID[1])
+    return np.where((depth > least) & (depth < most), depth, np.float32(0))
 
 
 def _pose(root: Path, picture: Path) -> Floats:

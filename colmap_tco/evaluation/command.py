@@ -102,8 +102,9 @@ class CloudConfig:
     )
     f_score: str = knob(
         "plain",
-        "plain: shares of all points. tanks: as Tanks and Temples, both clouds thinned with voxels of half "
-        "the threshold. eth3d: as ETH3D, shares within voxels, averaged over these; "
+        "plain: shares of all points. tanks: as Tanks and Temples, both clouds thinned once with voxels of "
+        "half the first threshold, which is the scene's; others are of its curve. eth3d: as "
+        "ETH3D, shares within voxels, averaged over these; "
         "with scans (.mlp) free space counts too.",
         choices=("plain", "tanks", "eth3d"),
     )

@@ -14,7 +14,8 @@ All distances count; none is cut off.
 The F-score is that of Tanks and Temples (Knapitsch et al. 2017, code at
 github.com/isl-org/TanksAndTemples, ``python_toolbox/evaluation/evaluation.py``): precision and recall are the
 shares of distances strictly below the threshold, F their harmonic mean. That benchmark thins both clouds
-with voxels of half the threshold before. ETH3D's is another one, see :mod:`colmap_tco.evaluation.eth3d`.
+with voxels of half the scene's threshold before, once for its whole curve, which goes up to five times the
+threshold. ETH3D's is another one, see :mod:`colmap_tco.evaluation.eth3d`.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from colmap_tco.evaluation.align import Similarity, icp, umeyama
 from colmap_tco.evaluation.depth import DepthFigures, depth_figures
 from colmap_tco.evaluation.eth3d import Scan, eth3d_curve, voxel_curve
 from colmap_tco.evaluation.maps import DepthPair, depth_pairs, true_maps
-from colmap_tco.evaluation.points import FScore, compare_clouds, f_curve, f_score
+from colmap_tco.evaluation.points import FScore, compare_clouds, f_curve
 from colmap_tco.evaluation.sources import (
     MESH_POINTS,
     CloudTruth,
@@ -283,9 +283,8 @@ def _scores(
         return eth3d_curve(points, scans, config.clouds.thresholds, config.clouds.voxel_size)
     if config.clouds.f_score == "eth3d":
         return voxel_curve(points, truth, config.clouds.thresholds, config.clouds.voxel_size)
-    if config.clouds.f_score == "tanks":
-        return tuple(f_score(points, truth, t, t / 2) for t in config.clouds.thresholds)
-    return f_curve(points, truth, config.clouds.thresholds)
+    voxel = config.clouds.thresholds[0] / 2 if config.clouds.f_score == "tanks" else None
+    return f_curve(points, truth, config.clouds.thresholds, voxel)
 
 
 def thinned(points: Floats, most: int) -> Floats:

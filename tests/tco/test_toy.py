@@ -119,7 +119,10 @@ def test_the_plane_is_found(scene: Wall) -> None:
         (replace(FIT, ablation=AblationConfig(source_order="overlap")), 0.4),
         (replace(FIT, ablation=AblationConfig(confident_opacity=False, radius_factor=1.0)), 0.35),
         (replace(FIT, ablation=AblationConfig(free_surfels=True)), 0.35),
-        (replace(FIT, lora_targets=(), ablation=AblationConfig(unfrozen=("plane",))), 0.5),
+        (
+            replace(FIT, lora_targets=(), ablation=AblationConfig(unfrozen=("plane",), unfrozen_rate=0.01)),
+            0.5,
+        ),
         (replace(FIT, lora_targets=(), ablation=AblationConfig(free_depth=True, free_rate=0.03)), 0.85),
     ],
     ids=["sources", "reference", "published", "overlap", "opaque", "surfels", "unfrozen", "depth"],
@@ -130,6 +133,22 @@ def test_every_variant_lowers_the_error(scene: Wall, config: TCOConfig, share: f
     after = optimize(net, scene.views, scene.priors, config)
     assert error(after, scene) < share * error(before, scene)
     assert torch.equal(net.plane.weight, Toy().plane.weight)
+
+
+def test_unfrozen_modules_have_a_rate_of_their_own_beside_the_adapters(scene: Wall) -> None:
+    """Adam's first step is as long as the rate, so that it tells whose rate moved what."""
+
+    def moved(rate: float, unfrozen_rate: float) -> Tensor:
+        ablation = AblationConfig(unfrozen=("plane",), unfrozen_rate=unfrozen_rate)
+        config = replace(FIT, steps=1, rate=rate, ablation=ablation)
+        return optimize(Toy(), scene.views, scene.priors, config).prediction.depth
+
+    alone = optimize(Toy(), scene.views, scene.priors, replace(FIT, steps=1)).prediction.depth
+    still = moved(0, 0)
+    torch.testing.assert_close(moved(0.01, 0), alone)
+    small, large = (moved(0, rate) - still for rate in (0.001, 0.002))
+    assert float(small.abs().max()) > 1e-4
+    torch.testing.assert_close(large, 2 * small, rtol=0.02, atol=1e-5)
 
 
 def test_plain_camera_penalties_are_the_papers(scene: Wall) -> None:

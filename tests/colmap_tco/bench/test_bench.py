@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from colmap_tco.backbones import NetworkConfig
-from colmap_tco.bench.command import BenchConfig, bench
+from colmap_tco.bench.command import DATASETS, BenchConfig, bench, width
 from colmap_tco.errors import InputError, PartlyDoneError
 from colmap_tco.progress import Progress
+from colmap_tco.published import NETWORKS
 from tco.backbones.checkpoints import save
 from tco.options import TCOConfig
 from tests.colmap_tco.datasets import layouts
@@ -153,6 +154,57 @@ def test_a_scene_that_fails_has_a_reason_and_the_others_figures(config: BenchCon
     assert table(config, "scenes")["base, staircase"]["acc_mean"]
 
 
+def test_one_frame_has_no_other_to_be_compared_with(config: BenchConfig, tmp_path: Path) -> None:
+    """NRGBD's thin_geometry has one frame in the sparse setting; no row of it stops the others."""
+    layouts.nrgbd(tmp_path / "one", 1)
+    rows = ("raw-depth", "surfels", "tco", "pose", "noise=3/0.05/0.05")
+    bench(replace(config, root=tmp_path / "one", rows=rows), Progress())
+    found = {row: tuple(figures(config, row, "kitchen").values()) for row in rows}
+    assert found["surfels"] == pytest.approx(found["raw-depth"], rel=1e-9)
+
+
+def test_a_row_that_cannot_end_is_listed_and_the_others_go_on(config: BenchConfig) -> None:
+    """Without adapters there is nothing that the steps could change."""
+    nothing = replace(config, rows=("base", "tco"), scenes=("kitchen",))
+    with pytest.raises(PartlyDoneError, match=r"1 scenes without figures \(tco, kitchen: there is nothing"):
+        bench(replace(nothing, tco=TCOConfig(steps=1, lora_targets=())), Progress())
+    scenes = table(config, "scenes")
+    assert scenes["base, kitchen"]["acc_mean"] and "nothing to optimise" in scenes["tco, kitchen"]["failed"]
+
+
+def test_other_weights_of_the_same_size_or_another_root_are_other_settings(
+    config: BenchConfig, rooms: Path, tmp_path: Path
+) -> None:
+    one = replace(config, rows=("base",), scenes=("kitchen",))
+    mine = tmp_path / "mine.safetensors"
+    shutil.copyfile(config.network.weights, mine)
+    one = replace(one, network=replace(one.network, weights=str(mine)))
+    bench(one, Progress())
+    other = bytearray(mine.read_bytes())
+    other[-1] ^= 1
+    mine.write_bytes(other)
+    with pytest.raises(InputError, match=r"made with other settings \(weights\)"):
+        bench(one, Progress())
+    other[-1] ^= 1
+    mine.write_bytes(other)
+    shutil.copytree(rooms, tmp_path / "copy")
+    with pytest.raises(InputError, match=r"made with other settings \(root\)"):
+        bench(replace(one, root=tmp_path / "copy"), Progress())
+    bench(one, Progress())
+
+
+def test_the_tables_have_what_earlier_calls_made_alike(config: BenchConfig) -> None:
+    bench(replace(config, rows=("raw-depth",), scenes=("staircase",)), Progress())
+    bench(replace(config, rows=("steps=0",), image_width=42), Progress())
+    done = bench(replace(config, rows=("base",), scenes=("kitchen",)), Progress())
+    assert tuple(table(config)) == ("base", "raw-depth")
+    assert set(table(config, "scenes")) == {"base, kitchen", "raw-depth, staircase"}
+    assert "| raw-depth |" in done.text and "steps=0" not in done.text
+    bench(replace(config, rows=("raw-depth",), scenes=("kitchen",)), Progress())
+    assert tuple(table(config)) == ("raw-depth", "base")
+    assert [line["scenes"] for line in table(config).values()] == ["2", "1"]
+
+
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
@@ -194,6 +246,15 @@ def test_poses_from_depths_on_scannet(config: BenchConfig, tmp_path: Path) -> No
         bench(replace(scannet, rows=("tco",), published_settings=False, overwrite=True), Progress())
     with pytest.raises(InputError, match="poses are measured"):
         bench(replace(scannet, rows=("pose",)), Progress())
+
+
+def test_pictures_are_as_wide_as_in_the_published_evaluations() -> None:
+    """ScanNet's are loaded 512 wide and cut to whole patches of 14 pixels, the others 518 wide."""
+    for name in ("vggt", "pi3", "da3"):
+        wide = {dataset: width(BenchConfig(dataset=dataset), NETWORKS[name]) for dataset in DATASETS}
+        assert wide == {"eth3d": 518, "dtu": 518, "7scenes": 518, "nrgbd": 518, "scannet": 512 // 14 * 14}
+    assert width(BenchConfig(dataset="scannet"), NETWORKS["sweep"]) == 256
+    assert width(BenchConfig(dataset="scannet", image_width=70), NETWORKS["vggt"]) == 70
 
 
 @pytest.mark.slow

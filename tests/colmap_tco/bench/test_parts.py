@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from colmap_tco.bench.figures import point_figures, pose_figures
-from colmap_tco.bench.methods import check_row, reconstruct, rescaled
+from colmap_tco.bench.methods import check_row, held_priors, reconstruct, rescaled
 from colmap_tco.bench.noise import Noise
 from colmap_tco.bench.numbers import published as numbers
 from colmap_tco.bench.prepare import resized, unproject
@@ -24,7 +24,7 @@ from tco.objective import ObjectiveConfig
 from tco.options import EVERY, AblationConfig, TCOConfig
 from tco.penalties import in_first_view, rotation_angle
 from tco.terms import comparison
-from tco.types import Cameras
+from tco.types import Cameras, Priors
 from tests.colmap_tco.datasets import layouts
 from tests.tco.published import tiny_vggt
 
@@ -206,6 +206,75 @@ def test_published_settings_are_those_of_the_scripts_unless_the_user_says_otherw
     assert comparison(published("dtu", own))[0].renderer == "surface"
 
 
+@pytest.mark.parametrize(
+    ("dataset", "steps", "rate", "photometric"),
+    [
+        ("7scenes", 40, 1e-3, 0.2),
+        ("nrgbd", 40, 1e-4, 1),
+        ("dtu", 50, 2e-4, 1),
+        ("eth3d", 40, 5e-4, 0.2),
+        ("scannet", 40, 2e-4, 0),
+    ],
+)
+def test_every_dataset_has_the_settings_of_its_script(
+    dataset: str, steps: int, rate: float, photometric: float
+) -> None:
+    """tco_steps, tco_lr and lambda_mv_consistency of scripts/tco_vggt_*.sh; ScanNet compares depths alone."""
+    found = published(dataset, TCOConfig())
+    assert (found.steps, found.rate, found.photometric_weight) == (steps, rate, photometric)
+    depths = float(dataset == "scannet")
+    assert (found.geometric_weight, found.depth_weight) == (depths, depths)
+    assert (found.lora_rank, found.lora_alpha, found.clip) == (4, 16, 1)
+    assert found.lora_targets == ("qkv", "proj", "fc1", "fc2")
+    assert (found.sparse_weight, found.consistency_weight, found.camera_rate, found.structure) == (0, 0, 0, 0)
+    assert not found.exposure and found.point_dropout == 0
+    assert found.ablation.decode_all and found.ablation.source_order == "uniform"
+    assert found.targets == EVERY and found.refresh == 1 and found.polish.polish_looks == 0
+    assert found.ablation.unfrozen_rate == 1e-5  # heads_lr
+
+
+@pytest.mark.parametrize(
+    ("name", "priors", "weights", "depth"),
+    [
+        ("tco", "pose,intrinsics", (1, 2, 0.01), False),
+        ("tco", "pose", (1, 2, 0), False),
+        ("tco", "intrinsics", (0, 0, 0.01), False),
+        ("tco", "depth", (0, 0, 0), True),
+        ("pose", "pose,intrinsics", (1, 2, 0), False),
+        ("intrinsics", "pose,intrinsics", (0, 0, 0.01), False),
+        ("depth", "pose,intrinsics", (0, 0, 0), True),
+        ("no-compatibility", "pose,intrinsics", (1, 2, 0.01), False),
+        ("rank=1", "pose,intrinsics", (1, 2, 0.01), False),
+        ("heads", "pose", (1, 2, 0), False),
+    ],
+)
+def test_each_row_holds_its_priors_with_the_papers_weights(
+    name: str, priors: str, weights: tuple[float, ...], depth: bool, tmp_path: Path
+) -> None:
+    layouts.nrgbd(tmp_path, 3)
+    prepared = resized(NRGBD(tmp_path).read("kitchen", range(3)), 56, 14)
+    (row,) = parse_rows([name], priors.split(","))
+    found = held_priors(prepared, prepared.cameras, row)
+    assert found.held is not None and found.cameras is None and found.sparse is None
+    assert (found.held.rotation, found.held.translation, found.held.focal) == weights
+    assert (found.depth is not None) == depth
+    one = resized(NRGBD(tmp_path).read("kitchen", range(1)), 56, 14)
+    alone = held_priors(one, one.cameras, row).held
+    assert alone is not None and (alone.rotation, alone.translation, alone.focal) == (0, 0, weights[2])
+
+
+def test_adapt_only_is_no_compatibility_with_views_compared() -> None:
+    """So that the two differ in that alone."""
+    adapt, silent = (
+        row.config(TCOConfig()) for row in parse_rows(["adapt-only", "no-compatibility"], ["pose"])
+    )
+    assert adapt == replace(TCOConfig(), polish=silent.polish) and silent.polish.polish_looks == 0
+    back = replace(
+        silent, photometric_weight=adapt.photometric_weight, consistency_weight=adapt.consistency_weight
+    )
+    assert back == adapt
+
+
 def test_published_figures_have_their_source_and_their_gaps() -> None:
     for dataset, settings in CHOICES.items():
         for setting in settings:
@@ -240,6 +309,27 @@ def test_noise_has_the_size_that_it_says() -> None:
     assert torch.equal(noisy.K[:, 0, 0], noisy.K[:, 1, 1])
     same = Noise().cameras(many, seed=1)
     torch.testing.assert_close(same.world_from_cam, many.world_from_cam)
+
+
+def test_noise_is_told_as_it_is_or_so_many_times_as_large() -> None:
+    """Each axis has a third of the variance, added to what was uncertain before; the cameras are the same."""
+    exact = cameras(2)
+    centre = exact.world_from_cam[:, :3, 3]
+    unit = (centre - centre.mean(0)).norm(dim=-1).mean()
+    before = torch.full((4,), 0.003)
+    given = Priors(exact, rotation_sigma=before, centre_sigma=before, focal_sigma=before)
+    noise = Noise(3.0, 0.05, 0.02)
+    for stated in (1.0, 0.5, 3.0):
+        noisy = noise(given, 1, stated)
+        assert noisy.cameras is not None
+        torch.testing.assert_close(noisy.cameras.world_from_cam, noise.cameras(exact, 1).world_from_cam)
+        for sigma, one in (
+            (noisy.rotation_sigma, np.radians(3.0) / 3**0.5),
+            (noisy.centre_sigma, 0.05 * float(unit) / 3**0.5),
+            (noisy.focal_sigma, 0.02),
+        ):
+            expected = torch.tensor((0.003**2 + (stated * one) ** 2) ** 0.5, dtype=torch.float32)
+            torch.testing.assert_close(sigma, expected.expand(4))
 
 
 def test_networks_that_predict_cameras_can_run_every_row() -> None:

@@ -129,6 +129,17 @@ def test_scannet_takes_every_third_of_the_first_270(tmp_path: Path) -> None:
     assert stem[:3] == ["0", "3", "6"] and stem[-1] == "267"
 
 
+@pytest.mark.parametrize("prepared", [False, True])
+def test_scannet_s_depths_count_between_a_millimetre_and_ten_metres(tmp_path: Path, prepared: bool) -> None:
+    layouts.scannet(tmp_path, 3, prepared=prepared)
+    (file,) = tmp_path.rglob("frame_0000.png" if prepared else "depth/0.png")
+    counts = np.full((120, 160), 2500, np.uint16)
+    counts[0, :4] = [1, 2, 9999, 10_000]
+    assert cv2.imwrite(str(file), counts)
+    (frame,) = open_dataset("scannet", tmp_path).read("scene0707_00", [0]).frames
+    np.testing.assert_allclose(frame.depth()[0, :5], [0, 0.002, 9.999, 0, 2.5], rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("dataset", "setting", "count", "frames"),
     [

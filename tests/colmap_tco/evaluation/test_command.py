@@ -371,6 +371,37 @@ class TestCloud:
         assert cloud["thresholds"][0]["recall"] == 1
         assert 0.3 < cloud["thresholds"][0]["precision"] < 0.7
 
+    def test_tanks_is_the_curve_of_clouds_thinned_once(self, tmp_path: Path) -> None:
+        """As the benchmark has it: voxels of half the scene's threshold, a histogram of the distances in
+        steps of a hundredth of it up to five times it, and shares from its sums; all written out here."""
+        rng, tau = np.random.default_rng(0), 0.2
+        truth = np.c_[rng.uniform(0, 3, (900, 2)), np.zeros(900)]
+        half = truth[truth[:, 0] < 1.5]
+        points = half[rng.integers(0, len(half), 1600)] + rng.normal(0, 0.08, (1600, 3))
+
+        def thinned(cloud: Floats) -> Floats:
+            cells = np.floor((cloud - cloud.min(0) + tau / 4) / (tau / 2)).astype(int)
+            _, which = np.unique(cells, axis=0, return_inverse=True)
+            return np.stack([cloud[which.ravel() == k].mean(0) for k in range(which.max() + 1)])
+
+        ours, theirs = thinned(points), thinned(truth)
+        assert len(ours) < 0.9 * len(points)
+        apart = np.linalg.norm(ours[:, None] - theirs[None], axis=2)
+        bins = np.arange(0, 5 * tau, tau / 100)
+        precision, recall = (
+            np.cumsum(np.histogram(d, bins)[0]) / len(d) for d in (apart.min(1), apart.min(0))
+        )
+        files = [write_cloud(tmp_path / name, cloud) for name, cloud in (("o.ply", points), ("t.ply", truth))]
+        settings = config(
+            files[1], f_score="tanks", thresholds=(tau, 0.5 * tau, 3 * tau), units={"metres_per_unit": 1.0}
+        )
+        rows = run(files[0], settings).figures["cloud"]["thresholds"]
+        for row, last in zip(rows, (99, 49, 299), strict=True):
+            p, r = precision[last], recall[last]
+            assert (row["precision"], row["recall"]) == pytest.approx((p, r))
+            assert row["f"] == pytest.approx(2 * p * r / (p + r))
+        assert 0.05 < recall[49] < recall[99] < recall[299] < 0.99 and precision[49] < precision[99]
+
     def test_eth3d_s_scans_know_free_space(self, root: Path, tmp_path: Path) -> None:
         """Scans from the cameras' places: what hides behind the plane is unobserved, what floats is wrong."""
         metric = np.array([METRES] * 3 + [1])

@@ -83,6 +83,48 @@ def test_depths_that_a_shift_makes_negative_are_misses_of_delta() -> None:
     )
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_every_figure_is_that_of_a_loop_over_the_pixels(seed: int) -> None:
+    """Errors of all sizes, holes in both, and no figure that another could be taken for."""
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(1, 4, (3, 8, 9))
+    d = z * np.exp(rng.choice([0.01, 0.04, 0.15, 0.5, 0.8], z.shape) * rng.normal(size=z.shape))
+    d[rng.random(z.shape) < 0.2], z[rng.random(z.shape) < 0.1] = 0, np.nan
+    relative, squares, near = [], [], []
+    within, measured, deltas = [0, 0], 0, [0, 0, 0]
+    for predicted, true in zip(d.ravel(), z.ravel(), strict=True):
+        if not true > 0:
+            continue
+        measured += 1
+        if not predicted > 0:
+            continue
+        off = abs(predicted - true) / true
+        relative.append(off)
+        squares.append((predicted - true) ** 2)
+        near.append(max(predicted / true, true / predicted))
+        within[0] += off < 0.02
+        within[1] += off < 0.05
+        for k in range(3):
+            deltas[k] += near[-1] < 1.25 ** (k + 1)
+    ordered, both = sorted(relative), len(relative)
+    expected = {
+        "abs_rel": sum(relative) / both,
+        "rmse": (sum(squares) / both) ** 0.5,
+        "delta_1_25": deltas[0] / both,
+        "delta_1_25_2": deltas[1] / both,
+        "delta_1_25_3": deltas[2] / both,
+        "d2": within[0] / measured,
+        "d5": within[1] / measured,
+        "coverage": both / measured,
+        "median": (ordered[(both - 1) // 2] + ordered[both // 2]) / 2,
+        "scale": 1.0,
+        "shift": 0.0,
+        "pixels": measured,
+    }
+    assert vars(depth_figures(d, z)) == pytest.approx(expected)
+    assert len({round(value, 3) for value in expected.values()}) == len(expected)
+
+
 def test_figures_are_those_of_the_pixels_in_any_arrangement() -> None:
     z = truth()
     d = z * np.random.default_rng(2).uniform(0.8, 1.3, z.shape)
