@@ -21,8 +21,6 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from colmap_tco.errors import DensifyError
 from colmap_tco.fusion_config import FusionConfig
 from colmap_tco.fusion_input import FusionMaps, FusionView
@@ -71,6 +69,7 @@ def fuse(
 
     Raises:
         EmptyCloudError: no point is left; the message names the filter that removed most.
+        InputError: ``voxel_size`` is too small for the cloud.
         ValueError: as :func:`fuse_views`; ``agreed`` are other views, or have no error.
     """
     config = config or FusionConfig()
@@ -127,13 +126,13 @@ def fuse_views(
             one, or that ``max_agreed_error`` excludes, vote and do not become points.
 
     Raises:
-        ValueError: settings or neighbours out of range, or arrays of a view that do not fit together.
+        ValueError: neighbours out of range, or arrays of a view that do not fit together.
     """
     from colmap_tco import _fusion_noise
     from colmap_tco._fusion_reference import Reference
     from colmap_tco._fusion_shelf import Shelf
 
-    _check(views, config)
+    _check(views)
     with Workers(config.num_threads) as workers:
         shelf = Shelf(views, config, workers, covered)
         tolerance = report.tolerance = _fusion_noise.tolerance(shelf, views, config)
@@ -145,17 +144,7 @@ def fuse_views(
             yield cloud
 
 
-def _check(views: Sequence[FusionView], config: FusionConfig) -> None:
-    for name in ("min_num_pixels", "check_num_images", "max_reproj_error", "max_depth_error", "cache_size"):
-        if not getattr(config, name) > 0:
-            raise ValueError(f"{name} must be positive, not {getattr(config, name)}")
-    for name in ("voxel_size", "max_points", "max_depth_ratio", "min_tri_angle", "max_agreed_error"):
-        if not getattr(config, name) >= 0:
-            raise ValueError(f"{name} must not be negative, it is {getattr(config, name)}")
-    if config.roi and not (len(config.roi) == 6 and np.all(np.less(config.roi[:3], config.roi[3:]))):
-        raise ValueError(
-            f"roi must be xmin,ymin,zmin,xmax,ymax,zmax with each minimum below its maximum, not {config.roi}"
-        )
+def _check(views: Sequence[FusionView]) -> None:
     for position, view in enumerate(views):
         wrong = [n for n in view.neighbours if not 0 <= n < len(views) or n == position]
         if wrong or len(set(view.neighbours)) != len(view.neighbours):
