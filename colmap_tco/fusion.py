@@ -3,9 +3,9 @@
 Each view in turn is the reference. A pixel of it becomes a point if enough neighbouring views agree:
 its depth, moved into the neighbour, meets the surface that the neighbour's depth and normal describe
 there (``max_depth_error``), that surface point falls back onto the pixel (``max_reproj_error``), and
-the two normals agree (``max_normal_error``). The point is the confidence-weighted mean of the agreeing
-surfaces, its colour the median of their images, and the pixels of the other views
-that it was made of are not used as references again.
+the two normals agree (``max_normal_error``). The point is a mean of the agreeing surfaces, weighted by
+confidence and robust (:mod:`colmap_tco._mean_kernels`), and so is its normal; its colour is the median of
+their images. The pixels of the other views that it was made of are not used as references again.
 
 Where that leaves gaps, the depths that the views agreed on when they were asked for each other's
 (:mod:`tco.consensus`) are fused in the same way. A pixel becomes a point there if the views were hardly
@@ -129,16 +129,19 @@ def fuse_views(
         ValueError: neighbours out of range, or arrays of a view that do not fit together.
     """
     from colmap_tco import _fusion_noise
-    from colmap_tco._fusion_reference import Reference
+    from colmap_tco._fusion_reference import Bounds, Reference
     from colmap_tco._fusion_shelf import Shelf
 
     _check(views)
     with Workers(config.num_threads) as workers:
         shelf = Shelf(views, config, workers, covered)
-        tolerance = report.tolerance = _fusion_noise.tolerance(shelf, views, config)
-        log.debug("fusion tolerates %s", tolerance)
+        noise = _fusion_noise.noise(shelf, views, config)
+        bounds = Bounds(_fusion_noise.tolerance(noise, config), _fusion_noise.widths(noise, config))
+        report.tolerance = bounds.tolerance
+        log.debug("fusion tolerates %s; means are taken within %.2g of depth and %.2g rad", bounds.tolerance,
+                  *bounds.widths)  # fmt: skip
         for position in range(len(views)):
-            cloud = Reference(shelf, views, position, config, tolerance).fuse(report, noted)
+            cloud = Reference(shelf, views, position, config, bounds).fuse(report, noted)
             report.loads, report.peak_bytes = shelf.loads, shelf.peak_bytes
             shelf.finish(position)
             yield cloud
