@@ -38,7 +38,8 @@ class FusionConfig:
     check_num_images: int = knob(50, "Neighbours that a view is compared with, the best overlapping first.")
     cache_size: float = knob(
         4.0,
-        "Gigabytes of maps and images kept in memory (COLMAP: 32). More saves reading when views are many.",
+        "Gigabytes of maps and images kept in memory (COLMAP: 32). More saves reading when views are many. "
+        "The points come on top, with some 100 bytes each.",
     )
     num_threads: int = knob(-1, "Threads of all stages; -1 is one a core.")
     min_confidence: float = knob(

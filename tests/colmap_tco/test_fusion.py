@@ -353,6 +353,15 @@ def test_a_small_cache_gives_the_same_cloud_in_bounded_memory() -> None:
         assert report.loads > generous.loads == len(views)
 
 
+def test_the_report_tells_the_memory_of_the_points() -> None:
+    """Of all of them, thinned out or not: 47 bytes, 4 for each view that agrees, and one number more."""
+    cloud, report = fuse(noisy_views(), CONFIG)
+    assert report.cloud_bytes == cloud.nbytes == 47 * len(cloud) + 4 * len(cloud.visibility.images) + 8
+    few, thinned = fuse(noisy_views(), replace(CONFIG, max_points=100))
+    assert len(few) <= 100 and thinned.cloud_bytes == report.cloud_bytes
+    assert thinned.as_dict()["cloud_megabytes"] == round(cloud.nbytes / 1e6, 1) > 0
+
+
 def test_far_coordinates_lose_nothing() -> None:
     offset = np.array([4.5e6, -3.1e6, 812.0])
     views = Scene(sphere).views()
