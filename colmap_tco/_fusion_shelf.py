@@ -215,10 +215,11 @@ def _arrays(maps: FusionMaps) -> kernels.Maps:
     )
 
 
-def _bounds(config: FusionConfig, view: FusionView) -> tuple[float, float, float, float]:
+def _bounds(config: FusionConfig, view: FusionView) -> kernels.Bounds:
     bend = config.max_depth_bend if config.max_depth_bend > 0 else math.inf
     far = config.max_depth_ratio * view.reach if config.max_depth_ratio > 0 else math.inf
-    return config.min_confidence, bend, math.cos(math.radians(config.max_view_angle)), far
+    sure = float(np.float32(view.sure))  # as the maps have it
+    return config.min_confidence, bend, math.cos(math.radians(config.max_view_angle)), far, sure
 
 
 def _check_maps(view: FusionView, maps: FusionMaps, config: FusionConfig) -> None:

@@ -48,7 +48,8 @@ class FusionConfig:
     max_depth_bend: float = knob(
         0.05,
         "Pixels beside a discontinuity, where flying points arise, are dropped: those whose inverse depth q "
-        "has a relative second difference |q₋ − 2 q + q₊| / q above this; planes have none. 0: off.",
+        "has a relative second difference |q₋ − 2 q + q₊| / q above this; planes have none. Depths that "
+        "fill_only keeps stay. 0: off.",
     )
     max_view_angle: float = knob(
         85.0, "Surfaces seen at a larger angle to their normal, in degrees, are dropped. 90: off."

@@ -132,7 +132,7 @@ def test_smeared_edges_leave_no_points_between_the_surfaces(width: float) -> Non
 
 
 def test_an_empty_result_names_the_conflicts() -> None:
-    """The surface of each view is a tenth farther than that of the view before, which looks through it."""
+    """Each surface is a tenth farther than that of the view before: later views look through earlier ones."""
     views = Scene(disturb=lambda i, depth: depth * 1.1**i).views()
     with pytest.raises(
         DensifyError, match=r"dropped because other views look through them \(max_conflicts\)"
