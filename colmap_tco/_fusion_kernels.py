@@ -27,6 +27,10 @@ Maps = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDAr
 tuples, not classes of ours: numba's cache on disk would name the class, and fail to load once a later
 version has renamed it."""
 
+Bounds = tuple[float, float, float, float, float]
+"""Least confidence; largest relative second difference of the inverse depth; least cosine between the normal
+and the direction to the camera; largest depth; confidence of pixels whose second difference is free."""
+
 
 def camera(intrinsics: NDArray[np.float64]) -> NDArray[np.float64]:
     """fx, fy, cx, cy, 1/fx, 1/fy of (fx, fy, cx, cy): divisions would take half the time of a comparison."""
@@ -83,20 +87,20 @@ def _surface_marks(
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _depth_marks(
-    maps: Maps, bounds: tuple[float, float, float, float], row: int, marks: NDArray[np.uint8]
-) -> None:
+def _depth_marks(maps: Maps, bounds: Bounds, row: int, marks: NDArray[np.uint8]) -> None:
     """Complete the marks (W,) of a row by depth and confidence; the first reason of :data:`KEEP`… counts."""
     depth, _, confidence, _ = maps
-    least, bend, _, farthest = bounds
+    least, bend, _, farthest, sure = bounds
     height, width = depth.shape
     above, below = (row - 1, row + 1) if 0 < row < height - 1 else (row, row)
     for col in range(1, width - 1):
         bent = _bends(depth[row, col - 1], depth[row, col], depth[row, col + 1], bend)
+        bent &= confidence[row, col] != sure
         marks[col] = EDGE if bent & (marks[col] == KEEP) else marks[col]
     for col in range(width):
         z, mark = depth[row, col], marks[col]
         bent = _bends(depth[above, col], z, depth[below, col], bend)
+        bent &= confidence[row, col] != sure
         mark = EDGE if bent & (mark == KEEP) else mark
         mark = LOW_CONFIDENCE if confidence[row, col] < least else mark
         mark = FAR if z > farthest else mark
@@ -107,16 +111,14 @@ def _depth_marks(
 def pack(
     maps: Maps,
     camera: NDArray[np.float64],
-    bounds: tuple[float, float, float, float],
+    bounds: Bounds,
     rows: tuple[int, int],
     packed: NDArray[np.float32],
     counts: NDArray[np.int64],
 ) -> None:
     """Fill ``rows`` of ``packed`` (H, W, 5), with a depth of 0 where a pixel takes no part.
 
-    ``bounds``: least confidence, largest relative second difference of the inverse depth, least
-    cosine between the normal and the direction to the camera, largest depth. ``counts`` (9,) tells how
-    many pixels have each mark, and how many values are NOT_FINITE.
+    ``counts`` (9,) tells how many pixels have each mark, and how many values are NOT_FINITE.
     """
     depth, normal, confidence, mask = maps
     marks = np.empty(depth.shape[1], np.uint8)

@@ -1,9 +1,10 @@
-"""How much the views differ where they see the same surface, and the tolerances that follow from it."""
+"""How much the views differ where they see the same surface, and what follows from it for the fusion."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,22 +28,60 @@ _FACTOR = 1.5
 agree, so that among many views enough do; 2 and 3 let more wrong points in than right ones."""
 _MOST_REPROJ, _MOST_NORMAL = 4.0, 45.0
 """Bounds: times ``max_reproj_error``, and degrees."""
+_DEPTH_WIDTH, _NORMAL_WIDTH = 2.5, 2.0
+"""Widths of the robust means over median differences of two views: 2.4 σ of one view, for a median difference
+is 0.95 σ of depths, and 1.67 σ of each component of normals, of which two matter."""
+_LEAST_WIDTH = 0.25
+"""Least width, times the tolerance that was given: noise is not the same everywhere in a scene."""
 
 
-def tolerance(shelf: Shelf, views: Sequence[FusionView], config: FusionConfig) -> Tolerance:
-    """The tolerances of the settings, widened to 1.5 times the median difference between views."""
-    given = Tolerance(config.max_depth_error, config.max_reproj_error, config.max_normal_error)
-    if not config.adapt_to_noise:
-        return given
+@dataclass(frozen=True)
+class Noise:
+    """Median differences between two views of a surface.
+
+    Attributes:
+        depth: relative.
+        reproj: pixels of the depth map.
+        normal: radians.
+    """
+
+    depth: float
+    reproj: float
+    normal: float
+
+
+def noise(shelf: Shelf, views: Sequence[FusionView], config: FusionConfig) -> Noise | None:
+    """The noise of the depths, or None where hardly two views see a surface together."""
     found = _sample(shelf, views, config)
     found = found[found[:, 0] < _OTHER_SURFACE]
     if len(found) < _FEWEST:
+        return None
+    return Noise(*(float(np.median(column)) for column in found.T))
+
+
+def tolerance(found: Noise | None, config: FusionConfig) -> Tolerance:
+    """The tolerances of the settings, widened to 1.5 times the median difference between views."""
+    given = Tolerance(config.max_depth_error, config.max_reproj_error, config.max_normal_error)
+    if found is None or not config.adapt_to_noise:
         return given
-    depth, reproj, normal = (_FACTOR * float(np.median(column)) for column in found.T)
     return Tolerance(
-        max(given.depth, min(depth, config.most_depth_error)),
-        max(given.reproj, min(reproj, _MOST_REPROJ * given.reproj)),
-        max(given.normal, min(math.degrees(normal), _MOST_NORMAL)),
+        max(given.depth, min(_FACTOR * found.depth, config.most_depth_error)),
+        max(given.reproj, min(_FACTOR * found.reproj, _MOST_REPROJ * given.reproj)),
+        max(given.normal, min(_FACTOR * math.degrees(found.normal), _MOST_NORMAL)),
+    )
+
+
+def widths(found: Noise | None, config: FusionConfig) -> tuple[float, float]:
+    """Distances from the mean, relative and in radians, at which a vote has half its weight.
+
+    Where the noise is not known, they are the tolerances.
+    """
+    depth, normal = config.max_depth_error, math.radians(config.max_normal_error)
+    if found is None:
+        return depth, normal
+    return (
+        max(_DEPTH_WIDTH * found.depth, _LEAST_WIDTH * depth),
+        max(_NORMAL_WIDTH * found.normal, _LEAST_WIDTH * normal),
     )
 
 

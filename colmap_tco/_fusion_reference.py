@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_tco import _fusion_kernels, _merge_kernels, _vote_kernels
+from colmap_tco import _fusion_kernels, _mean_kernels, _merge_kernels, _vote_kernels
 from colmap_tco._fusion_gaps import Covered
 from colmap_tco._fusion_shelf import Shelf, ShelfView
 from colmap_tco.fusion_config import FusionConfig
@@ -21,8 +21,9 @@ from colmap_tco.fusion_input import FusionView, centre, other_from_reference
 from colmap_tco.fusion_report import FusionReport, Tolerance
 from colmap_tco.ply import Cloud, Visibility, join
 
-_BLOCK = 1 << 20
-"""Pixels of a reference that are voted on together; bounds the memory of the votes (some 90 MB)."""
+_BLOCK_BYTES = 1 << 28
+"""Most memory of the votes on those pixels of a reference that are voted on together. So much is needed where
+the neighbours do not fit the cache together; where they do, a thread has the votes of one range at a time."""
 _RANGE = 64 * _vote_kernels.TILE
 """Pixels that a thread takes at a time."""
 _COLOR_SAMPLES = 15
@@ -35,18 +36,33 @@ Group = list[tuple[int, ShelfView]]
 
 
 @dataclass(frozen=True)
+class Bounds:
+    """What agrees, and what is taken for noise.
+
+    Attributes:
+        tolerance: of comparisons.
+        widths: of the means, see :func:`colmap_tco._mean_kernels.average`.
+    """
+
+    tolerance: Tolerance
+    widths: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class _Part:
     """A range of M pixels of the reference, and the votes on them.
 
     Attributes:
         count: M.
         tiles: see :mod:`colmap_tco._vote_kernels`.
+        votes: see there.
         who: (words, at least M) one bit for each neighbour that agrees.
         failed: (3,) comparisons that failed by depth, reprojection and normal.
     """
 
     count: int
     tiles: _vote_kernels.Tiles
+    votes: _vote_kernels.Votes
     who: NDArray[np.uint64]
     failed: NDArray[np.int64]
 
@@ -56,7 +72,8 @@ class _Points:
     """The K pixels of a part that became points.
 
     Attributes:
-        part: where they are from.
+        who: of the part.
+        failed: of the part.
         kept: (K,) pixels of the part.
         supports: (K,) views that agree on each, the reference included.
         local: (K, 3) in the frame of the reference.
@@ -67,7 +84,8 @@ class _Points:
         removed: (4,) see :func:`colmap_tco._vote_kernels.accept`.
     """
 
-    part: _Part
+    who: NDArray[np.uint64]
+    failed: NDArray[np.int64]
     kept: NDArray[np.int64]
     supports: NDArray[np.int64]
     local: NDArray[np.float32]
@@ -87,14 +105,17 @@ class Reference:
         views: Sequence[FusionView],
         position: int,
         config: FusionConfig,
-        tolerance: Tolerance,
+        bounds: Bounds,
     ) -> None:
         self._shelf, self._views, self._position = shelf, views, position
-        self._config, self._tolerance = config, tolerance
+        self._config, self._tolerance, self._widths = config, bounds.tolerance, bounds.widths
         # A set in ascending order: the result does not depend on the order within the list.
         self._neighbours = sorted(views[position].neighbours[: config.check_num_images])
         self._own = shelf.get(position)
         self._transforms = [other_from_reference(views[n], views[position]) for n in self._neighbours]
+        self._centres = np.zeros((len(self._neighbours), 3), np.float32)
+        for slot, move in enumerate(self._transforms):
+            self._centres[slot] = -move[:, :3].T @ move[:, 3]
 
     def fuse(self, report: FusionReport, noted: Covered | None = None) -> Cloud:
         """The points of the view; ``report`` tells of its pixels, and ``noted`` is told of its points."""
@@ -105,9 +126,9 @@ class Reference:
         pixels = np.empty(own.taken.size, np.int64)
         found, valid = _fusion_kernels.free(own.packed, own.taken, pixels)
         report.pixels["already_fused"] += valid - found - own.dropped.get("max_agreed_error", 0)
-        pixels = pixels[:found]
+        pixels, block = pixels[:found], self._block()
         cloud = join(
-            c for first in range(0, found, _BLOCK) for c in self._fuse(pixels[first : first + _BLOCK], report)
+            c for first in range(0, found, block) for c in self._fuse(pixels[first : first + block], report)
         )
         if noted is not None:
             noted.add(self._position, cloud.points, own.camera)
@@ -127,23 +148,40 @@ class Reference:
     def _fuse(self, pixels: NDArray[np.int64], report: FusionReport) -> list[Cloud]:
         """The points of these pixels (M,), flat indices into the reference, range by range."""
         run = self._shelf.workers
-        parts = run.map(
-            self._begin, [pixels[first : first + _RANGE] for first in range(0, len(pixels), _RANGE)]
-        )
-        for group in self._shelf.together(self._position, self._neighbours):
-            run.map(lambda part, group=group: self._vote(part, group), parts)  # type: ignore[misc]
-        merged = run.map(self._merge, parts)
+        merged = self._points([pixels[first : first + _RANGE] for first in range(0, len(pixels), _RANGE)])
         for group in self._shelf.together(self._position, self._neighbours):
             run.map(lambda points, group=group: self._color(points, group), merged)  # type: ignore[misc]
         _count(report, merged)
         return run.map(self._finish, merged)
 
+    def _points(self, ranges: Sequence[NDArray[np.int64]]) -> list[_Points]:
+        """The points of ranges of pixels; votes are kept only as long as neighbours are missing."""
+        parts: list[_Part | None] = [None] * len(ranges)
+        voted = 0
+
+        def vote(i: int) -> _Points | None:
+            part = parts[i] or self._begin(ranges[i])
+            self._vote(part, group)
+            parts[i] = part if voted < len(self._neighbours) else None
+            return None if parts[i] else self._merge(part)
+
+        for group in self._shelf.together(self._position, self._neighbours):
+            voted += len(group)
+            merged = self._shelf.workers.map(vote, range(len(ranges)))
+        return [points for points in merged if points is not None]
+
+    def _block(self) -> int:
+        """Pixels that are voted on together."""
+        tile = _vote_kernels.TILE_SIZE + len(self._neighbours) * _vote_kernels.VOTE_SIZE
+        return max(_RANGE, _BLOCK_BYTES * _vote_kernels.TILE // (4 * tile))
+
     def _begin(self, pixels: NDArray[np.int64]) -> _Part:
         tiles = _vote_kernels.tiles_of(len(pixels))
         _vote_kernels.begin(self._own.packed, pixels, tiles)
+        votes = _vote_kernels.votes_of(len(pixels), len(self._neighbours))
         words = max(1, (len(self._neighbours) + 63) // 64)
         who = np.zeros((words, len(tiles) * _vote_kernels.TILE), np.uint64)
-        return _Part(len(pixels), tiles, who, np.zeros(3, np.int64))
+        return _Part(len(pixels), tiles, votes, who, np.zeros(3, np.int64))
 
     def _vote(self, part: _Part, group: Group) -> None:
         tolerance, config = self._tolerance, self._config
@@ -152,7 +190,7 @@ class Reference:
         for slot, other in group:
             pair = self._pair(slot, other.camera)
             _vote_kernels.vote(
-                part.tiles, other.packed, pair, limits, _bit(slot), part.who[slot >> 6], part.failed
+                part.tiles, part.votes, other.packed, pair, limits, slot, part.who, part.failed
             )
 
     def _merge(self, part: _Part) -> _Points:
@@ -171,18 +209,20 @@ class Reference:
         kept, supports = kept[:count].copy(), supports[:count].copy()
         means = np.empty((count, 3), np.float32), np.empty((count, 3)), np.empty((count, 3), np.float32)
         pose = np.concatenate([view.cam_from_world[:3, :3], centre(view)[None]])
-        _merge_kernels.average(part.tiles, kept, own.camera, pose, means)
+        _mean_kernels.average(
+            part.tiles, part.votes, kept, own.camera, pose, self._centres, self._widths, means
+        )
         samples = np.empty((count, min(_COLOR_SAMPLES, 1 + len(self._neighbours)), 3), np.uint8)
         sampled = np.zeros(count, np.uint8)
         pair = _fusion_kernels.pair(own.camera, own.image_camera, np.eye(3, 4))
         _merge_kernels.sample_colors(means[0], np.arange(count), pair, own.image, samples, sampled)
-        return _Points(part, kept, supports, *means, samples, sampled, removed)
+        return _Points(part.who, part.failed, kept, supports, *means, samples, sampled, removed)
 
     def _color(self, points: _Points, group: Group) -> None:
         """Sample the colours of a group's images, and mark as taken the pixels that a point is made of."""
         chosen = np.empty(len(points.kept) + 1, np.int64)
         for slot, other in group:
-            who = points.part.who[slot >> 6]
+            who = points.who[slot >> 6]
             found = chosen[: _merge_kernels.agreeing(who, points.kept, _bit(slot), chosen)]
             pair = self._pair(slot, other.image_camera)
             _merge_kernels.sample_colors(
@@ -202,7 +242,7 @@ class Reference:
         start = np.concatenate([[0], points.supports]).cumsum()
         images = np.empty(start[-1], np.uint32)
         order, before = np.argsort(theirs, kind="stable"), int((theirs < own).sum())
-        _merge_kernels.list_views(points.part.who, points.kept, order, theirs, (before, own), images)
+        _merge_kernels.list_views(points.who, points.kept, order, theirs, (before, own), images)
         return Cloud(points.points, points.normals, colors, Visibility(start, images))
 
     def _pair(self, slot: int, camera: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -217,7 +257,7 @@ def _bit(slot: int) -> np.uint64:
 
 def _count(report: FusionReport, merged: Sequence[_Points]) -> None:
     """Add up what became of the pixels of a block."""
-    failed = np.sum([np.zeros(3, np.int64), *(points.part.failed for points in merged)], 0)
+    failed = np.sum([np.zeros(3, np.int64), *(points.failed for points in merged)], 0)
     for name, number in zip(report.comparisons, failed.tolist(), strict=True):
         report.comparisons[name] += number
     removed = np.sum([np.zeros(4, np.int64), *(points.removed for points in merged)], 0).tolist()

@@ -111,7 +111,8 @@ class Shelf:
     def together(self, reference: int, others: Sequence[int]) -> Iterator[list[tuple[int, ShelfView]]]:
         """The other views with their numbers, in runs of as many as fit beside the reference, at least one.
 
-        The views of a run are held until the next is asked for.
+        Where there are no others, there is one run of none. The views of a run are held until the next is
+        asked for.
         """
         run: list[tuple[int, ShelfView]] = []
         try:
@@ -124,7 +125,7 @@ class Shelf:
                 self._in_use.add(other)
                 run.append((number, self.get(other)))
                 used += run[-1][1].nbytes
-            if run:
+            if run or not others:
                 yield run
         finally:
             self._in_use = set()
@@ -214,10 +215,11 @@ def _arrays(maps: FusionMaps) -> kernels.Maps:
     )
 
 
-def _bounds(config: FusionConfig, view: FusionView) -> tuple[float, float, float, float]:
+def _bounds(config: FusionConfig, view: FusionView) -> kernels.Bounds:
     bend = config.max_depth_bend if config.max_depth_bend > 0 else math.inf
     far = config.max_depth_ratio * view.reach if config.max_depth_ratio > 0 else math.inf
-    return config.min_confidence, bend, math.cos(math.radians(config.max_view_angle)), far
+    sure = float(np.float32(view.sure))  # as the maps have it
+    return config.min_confidence, bend, math.cos(math.radians(config.max_view_angle)), far, sure
 
 
 def _check_maps(view: FusionView, maps: FusionMaps, config: FusionConfig) -> None:

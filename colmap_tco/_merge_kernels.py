@@ -1,4 +1,4 @@
-"""Compiled loops of :mod:`colmap_tco.fusion`: points, their colours, and the pixels they cover.
+"""Compiled loops of :mod:`colmap_tco.fusion`: the colours of points, the pixels they cover, and their views.
 
 Coordinates are those of the reference camera, as in :mod:`colmap_tco._fusion_kernels`.
 """
@@ -10,53 +10,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from colmap_tco._fusion_kernels import move
-from colmap_tco._vote_kernels import (
-    COL,
-    CONFIDENCE,
-    NORMAL_SUM,
-    NX,
-    ROW,
-    SHIFT,
-    TILE,
-    WEIGHT,
-    Tiles,
-    Z,
-)
-
-Points = tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float32]]
-"""M points: (M, 3) in the frame of the reference, (M, 3) in that of the model, normals (M, 3) there."""
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def average(
-    tiles: Tiles, kept: NDArray[np.int64], camera: NDArray[np.float64], pose: NDArray[np.float64], out: Points
-) -> None:
-    """Fill ``out`` with the weighted means of the votes on the pixels ``kept`` (M,) of ``tiles``.
-
-    ``pose`` (4, 3) holds the rotation of cam_from_world and, in the last row, the camera's position.
-    """
-    local, points, normals = out
-    n, p = np.empty(3), np.empty(3)
-    for k in range(len(kept)):
-        tile, m = tiles[kept[k] // TILE], kept[k] % TILE
-        z, own = float(tile[Z + m]), float(tile[CONFIDENCE + m])
-        scale = 1.0 / (own + tile[WEIGHT + m])
-        x = (float(tile[COL + m]) + 0.5 - camera[2]) * camera[4]
-        y = (float(tile[ROW + m]) + 0.5 - camera[3]) * camera[5]
-        p[0], p[1], p[2] = x * z, y * z, z
-        length = 0.0
-        for axis in range(3):
-            p[axis] += tile[SHIFT + axis * TILE + m] * scale
-            n[axis] = own * tile[NX + axis * TILE + m] + tile[NORMAL_SUM + axis * TILE + m]
-            length += n[axis] * n[axis]
-        length = 1.0 / np.sqrt(length)
-        for axis in range(3):
-            local[k, axis] = p[axis]
-            points[k, axis] = (
-                p[0] * pose[0, axis] + p[1] * pose[1, axis] + p[2] * pose[2, axis] + pose[3, axis]
-            )
-            turned = n[0] * pose[0, axis] + n[1] * pose[1, axis] + n[2] * pose[2, axis]
-            normals[k, axis] = turned * length
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -19,24 +19,29 @@ TILE = 256
 # The rows of a tile, as where they begin: the pixel, then the votes on it.
 ROW, COL, Z, NX, NY, NZ, CONFIDENCE = range(0, 7 * TILE, TILE)
 """Row, column, depth, normal and confidence of a pixel; depth is NaN after the last pixel."""
-SEEN, SUPPORT, CONFLICTS, WEIGHT, SHIFT, NORMAL_SUM, COSINE = (k * TILE for k in (7, 8, 9, 10, 11, 14, 17))
+SEEN, SUPPORT, CONFLICTS, COSINE = range(7 * TILE, 11 * TILE, TILE)
 """Votes on a pixel: views whose image contains it; that agree, the reference included; that look through
-it; sum of the weights of the neighbours that agree; weighted sums of the ways to their surfaces (three
-rows) and of their normals (three rows), in the reference frame; cosine of the largest angle between the
-rays of the reference and of a view that agrees."""
-TILE_SIZE = 18 * TILE
+it; cosine of the largest angle between the rays of the reference and of a view that agrees."""
+TILE_SIZE = 11 * TILE
 """float32 numbers of a tile; :data:`Tiles` is (tiles, TILE_SIZE)."""
+
+# The rows of one neighbour's votes on a tile.
+WEIGHT, OFF, TURNED = 0, TILE, 2 * TILE
+"""Where the neighbour agrees, its confidence, its relative depth error, and its normal in the frame of the
+reference (three rows); else 0."""
+VOTE_SIZE = 5 * TILE
+"""float32 numbers of these votes; :data:`Votes` is (tiles, neighbours · VOTE_SIZE)."""
 
 # The rows of the scratch of one tile.
 _X, _Y, _DEPTH, _I, _J, _AT = range(0, 6 * TILE, TILE)
 """The point in the other view: ray, depth, column and row of the pixel, its flat index or −1."""
-_D, _N, _C, _ERROR, _BACK, _AGREE, _SHIFT, _TURNED, _LIMIT, _OUTCOME = (
-    k * TILE for k in (6, 7, 10, 11, 12, 13, 14, 17, 20, 21)
+_D, _N, _C, _ERROR, _BACK, _AGREE, _TURNED, _LIMIT, _OUTCOME = (
+    k * TILE for k in (6, 7, 10, 11, 12, 13, 14, 17, 18)
 )
 """The other view's depth, normal (three rows) and confidence there; relative depth error, squared
-reprojection error, cosine between the normals, way to the other's surface and its normal in the reference
-frame (three rows each), relative error allowed, and the outcome."""
-_SCRATCH = 22 * TILE
+reprojection error, cosine between the normals, the other's normal in the reference frame (three rows),
+relative error allowed, and the outcome."""
+_SCRATCH = 19 * TILE
 
 Limits = tuple[float, float, float, float, float]
 """Relative depth error, reprojection error in pixels of the map, least cosine between normals,
@@ -49,12 +54,18 @@ _MOST_TILT = 1.05
 """Largest ratio of depths within one pixel that is ascribed to a slanted surface."""
 
 Tiles = NDArray[np.float32]
+Votes = NDArray[np.float32]
 Scratch = NDArray[np.float64]
 
 
 def tiles_of(count: int) -> Tiles:
     """Room for so many pixels."""
     return np.empty((-(-count // TILE), TILE_SIZE), np.float32)
+
+
+def votes_of(count: int, neighbours: int) -> Votes:
+    """Room for the votes of so many neighbours on so many pixels."""
+    return np.empty((-(-count // TILE), neighbours * VOTE_SIZE), np.float32)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -150,7 +161,6 @@ def _compare(tile: NDArray[np.float32], w: Scratch, pair: NDArray[np.float64]) -
         w[_ERROR + m] = error * (1.0 / depth)
         tx, ty, tz = a0 * nx + b0 * ny + c0 * nz, a1 * nx + b1 * ny + c1 * nz, a2 * nx + b2 * ny + c2 * nz
         w[_AGREE + m] = tx * tile[NX + m] + ty * tile[NY + m] + tz * tile[NZ + m]
-        w[_SHIFT + m], w[_SHIFT + TILE + m], w[_SHIFT + 2 * TILE + m] = dx, dy, dz
         w[_TURNED + m], w[_TURNED + TILE + m], w[_TURNED + 2 * TILE + m] = tx, ty, tz
 
 
@@ -184,20 +194,20 @@ def _judge(w: Scratch, limits: Limits) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _add(tile: NDArray[np.float32], w: Scratch) -> None:
-    """Add the votes of the other view to those on a tile."""
+def _add(tile: NDArray[np.float32], w: Scratch, votes: NDArray[np.float32], at: int) -> None:
+    """Count the votes of the other view on a tile, and note them in ``votes`` from ``at`` on."""
     for m in range(TILE):
         agrees = w[_OUTCOME + m] == AGREES
-        weight = w[_C + m]
         tile[SEEN + m] += np.float32(w[_OUTCOME + m] > UNSEEN)
         tile[SUPPORT + m] += np.float32(agrees)
         tile[CONFLICTS + m] += np.float32(w[_OUTCOME + m] == THROUGH)
-        tile[WEIGHT + m] += weight if agrees else 0.0
-    for axis in range(0, 3 * TILE, TILE):
-        for m in range(TILE):
-            agrees, weight = w[_OUTCOME + m] == AGREES, w[_C + m]
-            tile[SHIFT + axis + m] += weight * w[_SHIFT + axis + m] if agrees else 0.0
-            tile[NORMAL_SUM + axis + m] += weight * w[_TURNED + axis + m] if agrees else 0.0
+    for m in range(TILE):
+        agrees = w[_OUTCOME + m] == AGREES
+        votes[at + WEIGHT + m] = w[_C + m] if agrees else 0.0
+        votes[at + OFF + m] = w[_ERROR + m] if agrees else 0.0
+        votes[at + TURNED + m] = w[_TURNED + m] if agrees else 0.0
+        votes[at + TURNED + TILE + m] = w[_TURNED + TILE + m] if agrees else 0.0
+        votes[at + TURNED + 2 * TILE + m] = w[_TURNED + 2 * TILE + m] if agrees else 0.0
 
 
 @njit(cache=True, error_model="numpy")
@@ -218,31 +228,40 @@ def _widen(tile: NDArray[np.float32], w: Scratch, pair: NDArray[np.float64]) -> 
 @njit(cache=True, error_model="numpy", nogil=True)
 def vote(
     tiles: Tiles,
+    votes: Votes,
     other: NDArray[np.float32],
     pair: NDArray[np.float64],
     limits: Limits,
-    bit: np.uint64,
+    slot: int,
     who: NDArray[np.uint64],
     failed: NDArray[np.int64],
 ) -> None:
-    """Let one neighbour vote on the pixels of ``tiles``, and set ``bit`` in ``who`` where it agrees.
+    """Let one neighbour vote on the pixels of ``tiles``.
 
-    An agreeing view counts with its confidence. Weights that fall with the depth error would draw the
-    mean to the reference, whose own error is as large. ``failed`` (3,) counts the comparisons that
-    failed by depth, reprojection and normal.
+    Args:
+        tiles: the votes are counted there.
+        votes: and noted there.
+        other: (H, W, 5) the neighbour.
+        pair: the reference and it.
+        limits: of what agrees.
+        slot: its number.
+        who: (words, pixels) gets its bit where it agrees.
+        failed: (3,) counts the comparisons that failed by depth, reprojection and normal.
     """
     height, width = other.shape[0], other.shape[1]
     pixels = other.reshape(height * width, other.shape[2])
+    bits, bit, at = who[slot >> 6], np.uint64(1) << np.uint64(slot & 63), slot * VOTE_SIZE
     w = np.ones(_SCRATCH)
     for t in range(len(tiles)):
         tile = tiles[t]
         if _locate(tile, w, pair, width, height) == 0:
+            votes[t, at : at + VOTE_SIZE] = 0.0
             continue
         _fetch(w, pixels)
         _compare(tile, w, pair)
         _allow(tile, w, limits)
         _judge(w, limits)
-        _add(tile, w)
+        _add(tile, w, votes[t], at)
         _widen(tile, w, pair)
         by_depth, by_reprojection, by_normal = 0, 0, 0
         for m in range(TILE):
@@ -250,7 +269,7 @@ def vote(
             by_depth += (outcome >= OCCLUDED) & (outcome <= DEPTH)
             by_reprojection += outcome == REPROJECTION
             by_normal += outcome == NORMAL
-            who[t * TILE + m] |= bit if outcome == AGREES else np.uint64(0)
+            bits[t * TILE + m] |= bit if outcome == AGREES else np.uint64(0)
         failed[0] += by_depth
         failed[1] += by_reprojection
         failed[2] += by_normal

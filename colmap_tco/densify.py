@@ -332,8 +332,10 @@ def _fuse_and_write(
     why = None
     try:
         reach = outputs.reaches(tracks, used)
-        own = outputs.fusion_views(result.paths, used, neighbours, indices, reach)
-        agreed = outputs.fusion_views(result.paths, used, neighbours, indices, reach, agreed=True)
+        own, agreed = (
+            outputs.fusion_views(result.paths, used, neighbours, indices, reach, together, config.fill.sure)
+            for together in (False, True)
+        )
         cloud, fused = fuse(own, config.fusion, progress.advance, agreed if filling else ())
     except EmptyCloudError as error:  # the depth maps are there all the same
         cloud, fused, why = error.cloud, error.report, str(error)

@@ -10,6 +10,7 @@ nothing is interpolated across a discontinuity.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,6 +49,11 @@ class FillConfig:
         "confidence of the depths that fill_only keeps; that of the network's own is 1 to about 30. It is "
         "their weight where the fusion averages views.",
     )
+
+    @property
+    def sure(self) -> float:
+        """Confidence by which the fusion knows the depths that are kept; infinity where none are."""
+        return self.kept_confidence if self.fill_only else math.inf
 
 
 @dataclass(frozen=True)

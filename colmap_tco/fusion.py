@@ -3,16 +3,18 @@
 Each view in turn is the reference. A pixel of it becomes a point if enough neighbouring views agree:
 its depth, moved into the neighbour, meets the surface that the neighbour's depth and normal describe
 there (``max_depth_error``), that surface point falls back onto the pixel (``max_reproj_error``), and
-the two normals agree (``max_normal_error``). The point is the confidence-weighted mean of the agreeing
-surfaces, its colour the median of their images, and the pixels of the other views
-that it was made of are not used as references again.
+the two normals agree (``max_normal_error``). The point is a mean of the agreeing surfaces, weighted by
+confidence and robust (:mod:`colmap_tco._mean_kernels`), and so is its normal; its colour is the median of
+their images. The pixels of the other views that it was made of are not used as references again.
 
 Where that leaves gaps, the depths that the views agreed on when they were asked for each other's
 (:mod:`tco.consensus`) are fused in the same way. A pixel becomes a point there if the views were hardly
 apart on it (``max_agreed_error``), and if no point of the cloud is there yet; the others vote.
 
-Views are loaded when they are needed and kept while they fit ``cache_size``, so that memory does not
-grow with the number of views. The result does not depend on the number of threads.
+Views are loaded when they are needed and kept while they fit ``cache_size``, so that the memory for maps and
+images does not grow with their number. That for the points does: 47 bytes each and 4 for each view that
+agrees (:attr:`colmap_tco.ply.Cloud.nbytes`), 12 more while gaps are filled, and half as much again at the
+end, when the clouds of all views become one. The result does not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -20,8 +22,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from colmap_tco.errors import DensifyError
 from colmap_tco.fusion_config import FusionConfig
@@ -71,16 +71,21 @@ def fuse(
 
     Raises:
         EmptyCloudError: no point is left; the message names the filter that removed most.
+        InputError: ``voxel_size`` is too small for the cloud.
         ValueError: as :func:`fuse_views`; ``agreed`` are other views, or have no error.
     """
     config = config or FusionConfig()
     if agreed and [view.name for view in agreed] != [view.name for view in views]:
         raise ValueError("the agreed maps are not of the same views in the same order")
-    report, parts = FusionReport(), []
-    for part in _filled(views, agreed, config, report) if agreed else fuse_views(views, config, report):
-        parts.append(part)
-        fused()
-    cloud = join(parts)
+    report = FusionReport()
+
+    def parts() -> Iterator[Cloud]:
+        for part in _filled(views, agreed, config, report) if agreed else fuse_views(views, config, report):
+            fused()
+            yield part
+
+    cloud = join(parts())
+    report.cloud_bytes = cloud.nbytes
     kept = thin(cloud.points, config.voxel_size, config.max_points)
     if len(kept) < len(cloud):
         report.thin(kept)
@@ -127,35 +132,28 @@ def fuse_views(
             one, or that ``max_agreed_error`` excludes, vote and do not become points.
 
     Raises:
-        ValueError: settings or neighbours out of range, or arrays of a view that do not fit together.
+        ValueError: neighbours out of range, or arrays of a view that do not fit together.
     """
     from colmap_tco import _fusion_noise
-    from colmap_tco._fusion_reference import Reference
+    from colmap_tco._fusion_reference import Bounds, Reference
     from colmap_tco._fusion_shelf import Shelf
 
-    _check(views, config)
+    _check(views)
     with Workers(config.num_threads) as workers:
         shelf = Shelf(views, config, workers, covered)
-        tolerance = report.tolerance = _fusion_noise.tolerance(shelf, views, config)
-        log.debug("fusion tolerates %s", tolerance)
+        noise = _fusion_noise.noise(shelf, views, config)
+        bounds = Bounds(_fusion_noise.tolerance(noise, config), _fusion_noise.widths(noise, config))
+        report.tolerance = bounds.tolerance
+        log.debug("fusion tolerates %s; means are taken within %.2g of depth and %.2g rad", bounds.tolerance,
+                  *bounds.widths)  # fmt: skip
         for position in range(len(views)):
-            cloud = Reference(shelf, views, position, config, tolerance).fuse(report, noted)
+            cloud = Reference(shelf, views, position, config, bounds).fuse(report, noted)
             report.loads, report.peak_bytes = shelf.loads, shelf.peak_bytes
             shelf.finish(position)
             yield cloud
 
 
-def _check(views: Sequence[FusionView], config: FusionConfig) -> None:
-    for name in ("min_num_pixels", "check_num_images", "max_reproj_error", "max_depth_error", "cache_size"):
-        if not getattr(config, name) > 0:
-            raise ValueError(f"{name} must be positive, not {getattr(config, name)}")
-    for name in ("voxel_size", "max_points", "max_depth_ratio", "min_tri_angle", "max_agreed_error"):
-        if not getattr(config, name) >= 0:
-            raise ValueError(f"{name} must not be negative, it is {getattr(config, name)}")
-    if config.roi and not (len(config.roi) == 6 and np.all(np.less(config.roi[:3], config.roi[3:]))):
-        raise ValueError(
-            f"roi must be xmin,ymin,zmin,xmax,ymax,zmax with each minimum below its maximum, not {config.roi}"
-        )
+def _check(views: Sequence[FusionView]) -> None:
     for position, view in enumerate(views):
         wrong = [n for n in view.neighbours if not 0 <= n < len(views) or n == position]
         if wrong or len(set(view.neighbours)) != len(view.neighbours):

@@ -6,6 +6,17 @@ from dataclasses import dataclass
 
 from tco.config import knob
 
+_POSITIVE = (
+    "min_num_pixels", "max_reproj_error", "max_depth_error", "max_normal_error", "check_num_images",
+    "cache_size", "max_view_angle",
+)  # fmt: skip
+_NOT_NEGATIVE = (
+    "min_confidence", "max_depth_bend", "max_conflicts", "sigma_at_one", "most_depth_error",
+    "max_depth_ratio", "min_tri_angle", "max_agreed_error", "voxel_size", "max_points",
+)  # fmt: skip
+_LARGEST = {"max_normal_error": 180.0, "max_view_angle": 90.0, "min_tri_angle": 180.0}
+"""Degrees."""
+
 
 @dataclass(frozen=True)
 class FusionConfig:
@@ -18,7 +29,7 @@ class FusionConfig:
     )
     max_reproj_error: float = knob(
         2.0,
-        "Largest distance, in pixels of the full image, between a pixel and its way to a neighbour and back.",
+        "Largest distance, in pixels of the depth map, between a pixel and its way to a neighbour and back.",
     )
     max_depth_error: float = knob(
         0.01, "Largest relative difference between depths that agree: |z − d| / z. Raise it for noisy depths."
@@ -27,7 +38,8 @@ class FusionConfig:
     check_num_images: int = knob(50, "Neighbours that a view is compared with, the best overlapping first.")
     cache_size: float = knob(
         4.0,
-        "Gigabytes of maps and images kept in memory (COLMAP: 32). More saves reading when views are many.",
+        "Gigabytes of maps and images kept in memory (COLMAP: 32). More saves reading when views are many. "
+        "The points come on top, with some 100 bytes each.",
     )
     num_threads: int = knob(-1, "Threads of all stages; -1 is one a core.")
     min_confidence: float = knob(
@@ -36,10 +48,11 @@ class FusionConfig:
     max_depth_bend: float = knob(
         0.05,
         "Pixels beside a discontinuity, where flying points arise, are dropped: those whose inverse depth q "
-        "has a relative second difference |q₋ − 2 q + q₊| / q above this; planes have none. 0: off.",
+        "has a relative second difference |q₋ − 2 q + q₊| / q above this; planes have none. Depths that "
+        "fill_only keeps stay. 0: off.",
     )
     max_view_angle: float = knob(
-        85.0, "Surfaces seen at a larger angle to their normal, in degrees, are dropped. 90 switches it off."
+        85.0, "Surfaces seen at a larger angle to their normal, in degrees, are dropped. 90: off."
     )
     max_conflicts: float = knob(
         1.0,
@@ -49,13 +62,14 @@ class FusionConfig:
     adapt_to_noise: bool = knob(
         True,
         "Widen max_depth_error, max_reproj_error and max_normal_error to 1.5 times the median difference "
-        "between the views, for depths less exact than those of PatchMatch. Off: the values as given.",
+        "between the views, for depths less exact than those of PatchMatch; at most to most_depth_error, 4 "
+        "times max_reproj_error, and 45 degrees. Off: the values as given.",
     )
     sigma_at_one: float = knob(
         0.0,
         "Relative depth error s of a pixel of confidence 1; that of confidence c is s / c. If given, the "
-        "allowed error is max(max_depth_error, √(s²/c₁² + s²/c₂²)), for depths whose confidence is "
-        "calibrated. 0: not used.",
+        "allowed error is max(max_depth_error, √(s²/c₁² + s²/c₂²)), at most most_depth_error, for depths "
+        "whose confidence is calibrated. 0: not used.",
     )
     most_depth_error: float = knob(
         0.05, "Bound of the allowed relative error where adapt_to_noise or sigma_at_one raises it."
@@ -68,8 +82,8 @@ class FusionConfig:
     )
     min_tri_angle: float = knob(
         0.25,
-        "Far background: points that the reference and all views that agree with it see within an angle, in "
-        "degrees, smaller than this are dropped: their depth is little more than a guess. 0: off.",
+        "Far background: points are dropped if all views that agree on them see them from within this "
+        "angle, in degrees, of the reference's direction: their depth is little more than a guess. 0: off.",
     )
     roi: tuple[float, ...] = knob(
         (),
@@ -92,3 +106,20 @@ class FusionConfig:
         "Thin the cloud evenly in space to at most so many points, by the smallest cubes that do (see "
         "voxel_size); 3D Gaussian splatting wants 300000 to 500000. 0: off.",
     )
+
+    def __post_init__(self) -> None:
+        for name in _POSITIVE:
+            if not getattr(self, name) > 0:
+                raise ValueError(f"--{name} must be positive, not {getattr(self, name)}")
+        for name in _NOT_NEGATIVE:
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"--{name} must not be negative, it is {getattr(self, name)}")
+        for name, most in _LARGEST.items():
+            if getattr(self, name) > most:
+                raise ValueError(f"--{name} must be at most {most:g}, it is {getattr(self, name)}")
+        low, high = self.roi[:3], self.roi[3:]
+        if self.roi and not (len(self.roi) == 6 and all(a < b for a, b in zip(low, high, strict=True))):
+            raise ValueError(
+                "--roi must be xmin,ymin,zmin,xmax,ymax,zmax with each minimum below its maximum, not "
+                f"{','.join(map(str, self.roi))}"
+            )

@@ -48,6 +48,7 @@ class FusionView:
         neighbours: positions in the list of views that is fused, the best overlapping first.
         load: reads the arrays; called again if they had to leave the cache.
         reach: depth that hardly a point of the model exceeds in this view, for ``max_depth_ratio``.
+        sure: confidence of depths that were confirmed before: ``max_depth_bend`` leaves them; inf: of none.
     """
 
     name: str
@@ -57,6 +58,7 @@ class FusionView:
     neighbours: tuple[int, ...]
     load: Callable[[], FusionMaps]
     reach: float = math.inf
+    sure: float = math.inf
 
 
 def other_from_reference(other: FusionView, reference: FusionView) -> NDArray[np.float64]:

@@ -58,6 +58,7 @@ class FusionReport:
             those outside the region of interest and those thinned out included.
         loads: how often a view was read.
         peak_bytes: most bytes of maps and images that were held at once.
+        cloud_bytes: of all points, those in gaps and those thinned out included; they come on top.
     """
 
     pixels: dict[str, int] = field(default_factory=lambda: dict.fromkeys(PIXEL_FATES, 0))
@@ -68,6 +69,7 @@ class FusionReport:
     lowered: int = 0
     loads: int = 0
     peak_bytes: int = 0
+    cloud_bytes: int = 0
 
     def thin(self, kept: NDArray[np.int64]) -> None:
         """Take down that of the points so far only ``kept`` (M,), ascending indices, remain."""
@@ -91,6 +93,7 @@ class FusionReport:
             "points_with_fewer_views": self.lowered,
             "views_read": self.loads,
             "peak_megabytes": round(self.peak_bytes / 1e6, 1),
+            "cloud_megabytes": round(self.cloud_bytes / 1e6, 1),
             "gaps": self.gaps.as_dict() if self.gaps else None,
         }
 

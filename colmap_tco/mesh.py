@@ -76,8 +76,12 @@ class MeshConfig:
 
     def __post_init__(self) -> None:
         for name in ("cell_size", "trim", "max_distance", "min_part"):
-            if getattr(self, name) < 0:
+            if not getattr(self, name) >= 0:
                 raise ValueError(f"--{name} must not be negative, it is {getattr(self, name)}")
+        if not self.min_part < 1:
+            raise ValueError(f"--min_part is a share of all triangles, below 1, not {self.min_part}")
+        if math.isinf(self.cell_size):
+            raise ValueError("--cell_size must be finite")
 
 
 @dataclass(frozen=True)

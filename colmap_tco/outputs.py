@@ -193,6 +193,7 @@ def fusion_views(
     indices: Mapping[str, int],
     reach: Mapping[str, float] | None = None,
     agreed: bool = False,
+    sure: float = math.inf,
 ) -> list[FusionView]:
     """The views of a dense workspace for :func:`colmap_tco.fusion.fuse`; arrays are read when needed.
 
@@ -203,6 +204,7 @@ def fusion_views(
         indices: as :func:`write_model` returns them.
         reach: name → depth that hardly a point exceeds, see :func:`reaches`; no bound for other views.
         agreed: with the maps that the views agreed on instead of each view's own.
+        sure: see :class:`colmap_tco.fusion_input.FusionView`.
     """
     position = {view.name: i for i, view in enumerate(views)}
     return [
@@ -214,6 +216,7 @@ def fusion_views(
             neighbours=tuple(position[n] for n in neighbours[view.name] if n in position),
             load=lambda view=view: _masked(read_view(paths, view.name, agreed), view),  # type: ignore[misc]
             reach=(reach or {}).get(view.name, math.inf),
+            sure=sure,
         )
         for view in views
     ]

@@ -37,6 +37,8 @@ _DOUBLE_POINT = np.dtype(
 )
 _STRIPES = 0.01
 """Rounding above this share of the spacing of the points shows as stripes."""
+_BLOCK = 1 << 18
+"""Points that are brought into the form of the file together."""
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
@@ -89,6 +91,12 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.points)
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of the arrays: 47 bytes a point, and 4 for each image that confirmed it."""
+        of_lists = self.visibility.start.nbytes + self.visibility.images.nbytes
+        return self.points.nbytes + self.normals.nbytes + self.colors.nbytes + of_lists
+
     def select(self, points: NDArray[np.int64]) -> Cloud:
         """The cloud of some points (M,), in that order."""
         return Cloud(
@@ -97,16 +105,35 @@ class Cloud:
 
 
 def join(clouds: Iterable[Cloud]) -> Cloud:
-    """One cloud of the points of all, in order."""
-    parts = list(clouds)
-    counts = [np.diff(c.visibility.start) for c in parts]
-    start = np.concatenate([[0], *counts]).astype(np.int64).cumsum()
+    """One cloud of the points of all, in order.
+
+    Where ``clouds`` is a generator that keeps none, the memory needed is that of the result and of its
+    largest array once more.
+    """
+    points: list[NDArray[np.float64]] = [np.zeros((0, 3))]
+    normals: list[NDArray[np.float32]] = [np.zeros((0, 3), np.float32)]
+    colors: list[NDArray[np.uint8]] = [np.zeros((0, 3), np.uint8)]
+    counts: list[NDArray[np.uint32]] = [np.zeros(1, np.uint32)]
+    images: list[NDArray[np.uint32]] = [np.zeros(0, np.uint32)]
+    for cloud in clouds:
+        points.append(cloud.points)
+        normals.append(cloud.normals)
+        colors.append(cloud.colors)
+        counts.append(np.diff(cloud.visibility.start).astype(np.uint32))
+        images.append(cloud.visibility.images)
     return Cloud(
-        np.concatenate([np.zeros((0, 3)), *(c.points for c in parts)]),
-        np.concatenate([np.zeros((0, 3), np.float32), *(c.normals for c in parts)]),
-        np.concatenate([np.zeros((0, 3), np.uint8), *(c.colors for c in parts)]),
-        Visibility(start, np.concatenate([np.zeros(0, np.uint32), *(c.visibility.images for c in parts)])),
+        _moved(points),
+        _moved(normals),
+        _moved(colors),
+        Visibility(_moved(counts).cumsum(dtype=np.int64), _moved(images)),
     )
+
+
+def _moved(arrays: list[NDArray[_Number]]) -> NDArray[_Number]:
+    """One array of all, one after the other; the list is emptied."""
+    whole = np.concatenate(arrays)
+    arrays.clear()
+    return whole
 
 
 def needs_double(points: NDArray[np.floating]) -> bool:
@@ -139,7 +166,11 @@ def write_ply(
     Raises:
         ValueError: see :func:`write_ply_blocks`.
     """
-    write_ply_blocks(path, [(points, normals, colors)], double)
+    blocks = (
+        (points[i : i + _BLOCK], normals[i : i + _BLOCK], colors[i : i + _BLOCK])
+        for i in range(0, max(len(points), len(normals), len(colors), 1), _BLOCK)
+    )
+    write_ply_blocks(path, blocks, double)
 
 
 def write_ply_blocks(path: str | os.PathLike[str], blocks: Iterable[Block], double: bool = False) -> int:
@@ -155,7 +186,7 @@ def write_ply_blocks(path: str | os.PathLike[str], blocks: Iterable[Block], doub
     total, layout = 0, _DOUBLE_POINT if double else _POINT
     with tempfile.TemporaryFile(dir=Path(path).parent) as body:
         for points, normals, colors in blocks:
-            body.write(_records(path, (points, normals, colors), layout).tobytes())
+            body.write(_records(path, (points, normals, colors), layout).view(np.uint8).data)
             total += len(points)
         body.seek(0)
         with atomic_file(path) as file:

@@ -11,6 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_tco.errors import InputError
+
 _TRIES = 40
 """Sizes of cubes that are tried for a number of points."""
 _CLOSE = 0.98
@@ -19,6 +21,8 @@ _FEWEST = 0.9
 """Share of the points allowed below which cubes alone are not enough."""
 _MOST_CELLS = 2.0**62
 """Cells of a grid that a 64-bit number still tells apart."""
+_SMALLEST = 1e-6
+"""Side of a cube, as a share of the cloud's extent, of which any grid has fewer cells than that."""
 
 
 def thin(points: NDArray[np.float64], voxel_size: float = 0.0, max_points: int = 0) -> NDArray[np.int64]:
@@ -32,7 +36,7 @@ def thin(points: NDArray[np.float64], voxel_size: float = 0.0, max_points: int =
             nearly so many, as with points on a lattice, every cube gets more of its own in turn. 0: off.
 
     Raises:
-        ValueError: the cubes are too small to be told apart.
+        InputError: the cubes are too small to be told apart.
     """
     kept = np.arange(len(points))
     if voxel_size > 0 and len(points):
@@ -73,7 +77,11 @@ def _cells(points: NDArray[np.float64], size: float) -> NDArray[np.int64]:
     low = points.min(0)
     counts = np.floor((points.max(0) - low) / size) + 1
     if counts.prod() > _MOST_CELLS:
-        raise ValueError(f"voxel_size {size:g} is too small for a cloud of {counts.max() * size:g} units")
+        extent = counts.max() * size
+        raise InputError(
+            f"--voxel_size {size:g} is too small for a cloud of {extent:g} units; give at least "
+            f"{extent * _SMALLEST:g}, or 0 to keep all points"
+        )
     grid = np.floor((points - low) / size).astype(np.int64)
     shape = counts.astype(np.int64)
     flat = (grid[:, 0] * shape[1] + grid[:, 1]) * shape[2] + grid[:, 2]

@@ -9,6 +9,8 @@ The importer wants more than COLMAP does (observed in ``apps/InterfaceCOLMAP/Int
 - Neighbours by name, separated by commas, in ``stereo/patch-match.cfg``; ``__auto__`` and ``__all__`` give
   none. An empty line ends the list of all.
 - A name in a text file ends at a blank.
+- Points are held in float32, so that a model in map coordinates is moved to the origin
+  (:mod:`colmap_tco.export.centred`).
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ import numpy as np
 from colmap_tco import _pycolmap
 from colmap_tco.atomic import write_text
 from colmap_tco.errors import InputError
+from colmap_tco.export.centred import moved, offset_for, tell_offset
 from colmap_tco.export.command import copy_images
 from colmap_tco.export.dense import Dense, DenseView, flat_names
 from colmap_tco.ply import Visibility, write_ply, write_vis
@@ -45,7 +48,9 @@ def write_openmvs(dense: Dense, folder: Path) -> str:
     views = sorted(dense.views, key=lambda view: view.name)
     names = flat_names([view.name for view in views])
     copy_images(dense, names, target.images)
-    _write_sparse(dense, views, names, target.sparse)
+    cloud = dense.cloud()
+    offset = offset_for(cloud.points)
+    write_model_text(target.sparse, moved(_sparse(dense, views, names), offset))
     _write_maps(dense, views, names, target)
     neighbours = _neighbours(dense, views)
     listed = {name: [names[n] for n in others] for name, others in neighbours.items() if others}
@@ -56,15 +61,15 @@ def write_openmvs(dense: Dense, folder: Path) -> str:
         log.warning(
             "%d images have no neighbours: no other sees a point that they see", len(views) - len(listed)
         )
-    cloud = dense.cloud()
     order = {view.name: i for i, view in enumerate(views)}
     place = np.array([order[view.name] for view in dense.views], np.uint32)
-    write_ply(target.ply, cloud.points, cloud.normals, cloud.colors)
+    write_ply(target.ply, cloud.points - offset, cloud.normals, cloud.colors)
     write_vis(target.vis, Visibility(cloud.visibility.start, place[cloud.visibility.images]))
+    tell_offset(folder, offset)
     return f"{len(views)} images with depth maps, {len(cloud)} points; read it with InterfaceCOLMAP -i"
 
 
-def _write_sparse(dense: Dense, views: list[DenseView], names: dict[str, str], folder: Path) -> None:
+def _sparse(dense: Dense, views: list[DenseView], names: dict[str, str]) -> SparseModel:
     """The triangulated points with their tracks, ids counted from 1."""
     ids, xyz, rgb = _pycolmap.points(dense.model)
     renumbered = {old: new for new, old in enumerate(ids.tolist(), 1)}
@@ -89,7 +94,7 @@ def _write_sparse(dense: Dense, views: list[DenseView], names: dict[str, str], f
         flat[:, 1],
         flat[:, 2],
     )
-    write_model_text(folder, SparseModel({cameras[v.camera_id]: v.camera for v in views}, images, points3d))
+    return SparseModel({cameras[v.camera_id]: v.camera for v in views}, images, points3d)
 
 
 def _write_maps(dense: Dense, views: list[DenseView], names: dict[str, str], target: DensePaths) -> None:

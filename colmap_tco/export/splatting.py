@@ -1,7 +1,8 @@
 """For trainers of 3D Gaussian splats: ``images/`` and ``sparse/0`` with the cloud as its points.
 
 They read PINHOLE cameras, images by the last part of their names, and start from the points of the model;
-some (the original one) read ``sparse/0/points3D.ply`` in their place where it exists.
+some (the original one) read ``sparse/0/points3D.ply`` in their place where it exists. All compute in float32,
+so that a model in map coordinates is moved to the origin (:mod:`colmap_tco.export.centred`).
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from colmap_tco.export.centred import moved, offset_for, tell_offset
 from colmap_tco.export.command import copy_images
 from colmap_tco.export.dense import Dense, flat_names, thinned
 from colmap_tco.export.tracks import dense_model
@@ -26,12 +28,15 @@ def write_3dgs(dense: Dense, folder: Path, max_points: int) -> str:
     Raises:
         InputError: no cloud, no visibility, or a missing image.
     """
-    cloud = thinned(dense.cloud(), max_points)
+    cloud = dense.cloud()
+    offset = offset_for(cloud.points)
+    cloud = thinned(cloud, max_points)
     names = flat_names([view.name for view in dense.views])
     model, cloud = dense_model(dense, cloud, names)
     copy_images(dense, names, folder / "images")
-    write_binary(folder / "sparse" / "0", model)
-    write_ply(folder / "sparse" / "0" / "points3D.ply", cloud.points, cloud.normals, cloud.colors)
+    write_binary(folder / "sparse" / "0", moved(model, offset))
+    write_ply(folder / "sparse" / "0" / "points3D.ply", cloud.points - offset, cloud.normals, cloud.colors)
+    tell_offset(folder, offset)
     track = len(model.points.images) / len(cloud)
     return (
         f"{len(dense.views)} images, {len(np.unique(model.points.ids))} points in sparse/0, "

@@ -26,12 +26,12 @@ from colmap_tco.densify import Densified, DensifyConfig, densify
 from colmap_tco.errors import InputError, PartlyDoneError
 from colmap_tco.lock import locked
 from colmap_tco.maps import read_map
-from colmap_tco.outputs import read_view
+from colmap_tco.outputs import reaches, read_view
 from colmap_tco.ply import read_ply, read_vis
 from colmap_tco.priors import PriorConfig, held_out
 from colmap_tco.progress import Progress
 from colmap_tco.tracks import covisibility, read_tracks
-from colmap_tco.views import ViewConfig
+from colmap_tco.views import ViewConfig, make_views
 from colmap_tco.workspace import DensePaths, open_workspace
 from tco.options import ConsensusConfig, PolishConfig, TCOConfig
 
@@ -423,6 +423,19 @@ def test_other_settings_of_the_fusion_keep_the_depth_maps(fresh_room: Room) -> N
     some = next(iter(files))
     assert (anew.folder / some).stat().st_ino != files[some].st_ino
     assert anew.report["points"] == second.report["points"]
+    near = replace(settings, fusion=replace(settings.fusion, max_depth_ratio=0.8), overwrite=True)
+    assert_far_pixels_are_dropped(made(fresh_room.root, near), fresh_room.root, 0.8)
+
+
+def assert_far_pixels_are_dropped(result: Densified, root: Path, ratio: float) -> None:
+    """All that lie beyond so many times the reach of the model's points, in the maps that are fused."""
+    workspace = open_workspace(root)
+    views, _ = make_views(workspace, ViewConfig(), 8)
+    far = 0
+    for name, reach in reaches(read_tracks(workspace.model), views).items():
+        own = read_map(DensePaths(result.folder).own_maps(name)[0])
+        far += int((own > ratio * reach).sum())
+    assert result.report["fusion"]["pixels"]["max_depth_ratio"] == far > 1000
 
 
 @pytest.mark.parametrize("kind", ["vggt", "pi3", "da3", "mini"])

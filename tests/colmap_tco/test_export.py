@@ -342,6 +342,46 @@ def test_map_coordinates_cost_no_pixels(mapped: Path, tmp_path: Path) -> None:
         assert np.abs(xy - expected).max() < 1e-4
 
 
+def in_float32(entry: _pycolmap.Registered, points: Floats) -> Floats:
+    """Pixels (N, 2) of world points (N, 3), all computed in single precision as trainers of splats do."""
+    pose, xyz = entry.cam_from_world.astype(np.float32), points.astype(np.float32)
+    local = xyz @ pose[:, :3].T + pose[:, 3]
+    fx, fy, cx, cy = np.float32(entry.camera.params)
+    return np.asarray(local[:, :2] / local[:, 2:] * (fx, fy) + (cx, cy), np.float64)
+
+
+@pytest.mark.parametrize(("format", "sparse"), [("3dgs", "sparse/0"), ("openmvs", "sparse")])
+def test_programs_in_single_precision_get_the_model_at_the_origin(
+    mapped: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, format: str, sparse: str
+) -> None:
+    """In map coordinates float32 has steps of half a unit, where neighbouring points are 0.05 apart."""
+    with caplog.at_level("INFO"):
+        folder = exported(format, mapped, tmp_path / "out")
+    ply = folder / {"3dgs": "sparse/0/points3D.ply", "openmvs": "fused.ply"}[format]
+    text = (folder / "offset.txt").read_text()
+    offset = np.array([float(word) for word in text.split()])
+    assert text.strip() in caplog.text
+    np.testing.assert_array_equal(offset, np.round(offset))
+    assert np.abs(offset - ORIGIN).max() < 5
+    truth, _, _ = read_ply(mapped / "fused.ply")
+    points, _, _ = read_ply(ply)
+    assert b"property float x" in ply.read_bytes()[:200]
+    assert np.abs(points + offset - truth).max() < 1e-6
+    assert len(np.unique(points[:, 1])) > 0.9 * len(np.unique(truth[:, 1])) > 100
+    model = _pycolmap.load().Reconstruction(str(folder / sparse))
+    xyz = {key: point.xyz for key, point in model.points3D.items()}
+    for entry in _pycolmap.registered(model):
+        assert np.abs(entry.cam_from_world[:, 3]).max() < 20
+        xy, ids = _pycolmap.observations(model, entry.image_id)
+        assert len(ids) > 30
+        assert np.abs(in_float32(entry, np.array([xyz[i] for i in ids])) - xy).max() < 0.01
+
+
+@pytest.mark.parametrize("format", ["3dgs", "openmvs"])
+def test_a_model_at_the_origin_stays_where_it_is(root: Path, tmp_path: Path, format: str) -> None:
+    assert not (exported(format, root, tmp_path / "out") / "offset.txt").exists()
+
+
 def test_flat_names_are_flat_and_unique() -> None:
     given = ["a/b.png", "a_b.png", "a b.png", "c.png", "x,y/z.JPG"]
     flat = flat_names(given)

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from colmap_tco import _pycolmap
 from colmap_tco.errors import InputError
 from colmap_tco.fill import FillConfig, fill, open_existing
-from colmap_tco.fusion import FusionConfig, fuse
+from colmap_tco.fusion import FusionConfig, fuse, fuse_views
+from colmap_tco.fusion_report import FusionReport
 from colmap_tco.maps import write_map
 from colmap_tco.normals import normals_from_depth
 from colmap_tco.outputs import ViewMaps, fusion_views, undistorted_model, write_model, write_view
@@ -159,6 +160,28 @@ def test_the_fused_cloud_keeps_the_place_of_what_was_kept(made: Made, tmp_path: 
     kept = np.abs(off) < 0.1 * PIXEL
     assert 0.3 < kept.mean() < 0.9
     assert abs(off[kept].mean()) < 0.02 * PIXEL
+
+
+def test_kept_depths_stay_where_they_bend_and_ours_do_not(made: Made, tmp_path: Path) -> None:
+    """Every third pixel of what is kept is 8 % too near, and so is every third of what fills."""
+    existing = open_existing(config(made), made.views)
+    assert existing is not None
+    paths, kept, filled = DensePaths(tmp_path), 0, 0
+    for view in made.views:
+        maps, _ = fill(existing, view, maps_of(view))
+        third = np.indices(maps.depth.shape).sum(0) % 3 == 0
+        write_view(paths, view, replace(maps, depth=np.where(third, 0.92 * maps.depth, maps.depth)))
+        inside = np.pad(np.ones(np.subtract(maps.depth.shape, 2), bool), 1)
+        kept += int((inside & (maps.confidence == 30)).sum())
+        filled += int((inside & (maps.confidence < 30)).sum())
+    indices = {view.name: i for i, view in enumerate(made.views)}
+    neighbours = {name: [other for other in NAMES if other != name] for name in NAMES}
+    for sure, dropped in ((config(made).sure, filled), (FillConfig().sure, kept + filled)):
+        views = fusion_views(paths, made.views, neighbours, indices, sure=sure)
+        report = FusionReport()
+        list(fuse_views(views, FusionConfig(num_threads=1), report))
+        assert report.pixels["max_depth_bend"] == pytest.approx(dropped, rel=0.05)
+    assert filled > 10_000 < kept
 
 
 def test_a_result_of_other_cameras_is_refused(made: Made) -> None:

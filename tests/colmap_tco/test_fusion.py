@@ -11,11 +11,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial import cKDTree
 
+from colmap_tco import _fusion_noise
+from colmap_tco._fusion_shelf import Shelf
 from colmap_tco.errors import DensifyError
 from colmap_tco.fusion import FusionConfig, FusionMaps, FusionView, fuse, fuse_views
 from colmap_tco.fusion_report import FILTERS, FusionReport, Tolerance
 from colmap_tco.normals import normals_from_depth
 from colmap_tco.pinhole import Pinhole
+from colmap_tco.workers import Workers
 
 Floats = NDArray[np.float64]
 SIZE = (96, 72)
@@ -173,15 +176,26 @@ def test_nothing_is_fused_twice() -> None:
     assert seen.max() == 0
 
 
+@dataclass
+class Vote:
+    """Of a neighbour on the pixels (H, W) of a reference: whether it agrees, its relative depth error, its
+    normal (H, W, 3) in the world and its position (3,)."""
+
+    agrees: NDArray[np.bool_]
+    error: Floats
+    normal: Floats
+    eye: Floats
+
+
 def votes_by_hand(
     reference: FusionView, views: list[FusionView], config: FusionConfig
-) -> tuple[Floats, Floats]:
-    """A plain twin of the vote: (support, conflicts) of every pixel of the reference, (H, W) each."""
+) -> tuple[Floats, Floats, list[Vote]]:
+    """A plain twin of the vote: support and conflicts of every pixel of the reference, (H, W) each."""
     maps, pose = reference.load(), reference.cam_from_world
     shape = maps.depth.shape
     normals = maps.normal @ pose[:, :3]
     points = (rays(shape) * maps.depth[..., None] - pose[:, 3]) @ pose[:, :3]
-    support, conflicts = np.ones(shape), np.zeros(shape)
+    support, conflicts, votes = np.ones(shape), np.zeros(shape), []
     for other in (views[n] for n in reference.neighbours):
         theirs, move = other.load(), other.cam_from_world
         x, y, z = np.moveaxis(points @ move[:, :3].T + move[:, 3], -1, 0)
@@ -202,15 +216,41 @@ def votes_by_hand(
         dv = CAMERA.fy * shape[0] / CAMERA.height * (back[..., 1] / back[..., 2] - here[..., 1])
         cosine = (n @ move[:, :3] * normals).sum(-1)
         agrees = (np.abs(off) <= 1) & (np.hypot(du, dv) <= config.max_reproj_error)
-        support += seen & agrees & (cosine >= np.cos(np.radians(config.max_normal_error)))
+        agrees &= seen & (cosine >= np.cos(np.radians(config.max_normal_error)))
+        support += agrees
         conflicts += seen & (off > 3)
-    return support, conflicts
+        votes.append(Vote(agrees, off * config.max_depth_error, n @ move[:, :3], -move[:, :3].T @ move[:, 3]))
+    return support, conflicts, votes
+
+
+def means_by_hand(
+    reference: FusionView, votes: list[Vote], widths: tuple[float, float]
+) -> tuple[Floats, Floats]:
+    """A plain twin of the robust mean: points and normals (H, W, 3) in the world."""
+    maps, pose = reference.load(), reference.cam_from_world
+    eye, own = -pose[:, :3].T @ pose[:, 3], maps.normal @ pose[:, :3]
+    start = eye + (rays(maps.depth.shape) * maps.depth[..., None]) @ pose[:, :3]
+    weight = np.stack([np.ones(maps.depth.shape), *(vote.agrees.astype(float) for vote in votes)])
+    surface = np.stack([start, *(start + (start - v.eye) * v.error[..., None] for v in votes)])
+    normal = np.stack([own, *(vote.normal for vote in votes)])
+    away = np.abs(np.stack([((start - e) * own).sum(-1) for e in (eye, *(v.eye for v in votes))]))
+    surface[weight == 0], normal[weight == 0] = 0, 0
+    by_place, by_turn = weight, weight
+    for _ in range(3):  # a plain mean, and two with weights
+        point = (by_place[..., None] * surface).sum(0) / by_place.sum(0)[..., None]
+        turn = (by_turn[..., None] * normal).sum(0)
+        turn /= np.maximum(np.linalg.norm(turn, axis=-1, keepdims=True), 1e-9)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            off = ((surface - point) * own).sum(-1) / away / widths[0]
+        by_place = weight / (1 + off**2)
+        by_turn = weight / (1 + ((normal - turn) ** 2).sum(-1) / widths[1] ** 2)
+    return point, turn
 
 
 @pytest.mark.parametrize("shape", [(72, 96), (36, 48)])
 @pytest.mark.parametrize("noise", [0.003, 0.02])
-def test_votes_agree_with_a_plain_twin(shape: tuple[int, int], noise: float) -> None:
-    """With the filters off, the first view's points are those that the twin accepts."""
+def test_votes_and_means_agree_with_plain_twins(shape: tuple[int, int], noise: float) -> None:
+    """With the filters off, the first view's points are those that the twin accepts, where it has them."""
 
     def disturb(i: int, depth: Floats) -> Floats:
         rng = np.random.default_rng(i)
@@ -229,14 +269,22 @@ def test_votes_agree_with_a_plain_twin(shape: tuple[int, int], noise: float) -> 
     for view in views:
         drop = (view.load().normal == 0).all(-1)
         view.load().depth[drop] = 0
-    support, conflicts = votes_by_hand(views[0], views, config)
+    support, conflicts, votes = votes_by_hand(views[0], views, config)
     accepted = (views[0].load().depth > 0) & (support >= 3) & (conflicts <= support)
     cloud = next(iter(fuse_views(views, config, FusionReport())))
     assert 0.01 * accepted.size < accepted.sum() < 0.98 * accepted.size
     lengths = np.diff(cloud.visibility.start)
     assert abs(len(cloud) - accepted.sum()) <= 2
     if len(cloud) == accepted.sum():
-        assert (lengths != support[accepted]).mean() < 0.01
+        same = lengths == support[accepted]
+        assert same.mean() > 0.99
+        with Workers(1) as workers:
+            widths = _fusion_noise.widths(
+                _fusion_noise.noise(Shelf(views, config, workers), views, config), config
+            )
+        points, normals = (array[accepted] for array in means_by_hand(views[0], votes, widths))
+        assert np.abs(cloud.points - points)[same].max() < 2e-6 * DISTANCE
+        assert np.abs(cloud.normals - normals)[same].max() < 1e-4
 
 
 def test_every_pixel_is_accounted_for() -> None:
@@ -288,7 +336,7 @@ def test_threads_and_repetition_give_identical_bytes(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("colmap_tco._fusion_shelf._ROWS", 7)
     for threads in (1, 2, 5, 5):
         assert fused_bytes(views, replace(CONFIG, num_threads=threads)) == whole
-    monkeypatch.setattr("colmap_tco._fusion_reference._BLOCK", 1000)
+    monkeypatch.setattr("colmap_tco._fusion_reference._BLOCK_BYTES", 100_000)
     assert fused_bytes(views, replace(CONFIG, num_threads=5)) == whole
 
 
@@ -303,6 +351,15 @@ def test_a_small_cache_gives_the_same_cloud_in_bounded_memory() -> None:
         _, report = fuse(views, config)
         assert report.peak_bytes <= max(held, 2) * one
         assert report.loads > generous.loads == len(views)
+
+
+def test_the_report_tells_the_memory_of_the_points() -> None:
+    """Of all of them, thinned out or not: 47 bytes, 4 for each view that agrees, and one number more."""
+    cloud, report = fuse(noisy_views(), CONFIG)
+    assert report.cloud_bytes == cloud.nbytes == 47 * len(cloud) + 4 * len(cloud.visibility.images) + 8
+    few, thinned = fuse(noisy_views(), replace(CONFIG, max_points=100))
+    assert len(few) <= 100 and thinned.cloud_bytes == report.cloud_bytes
+    assert thinned.as_dict()["cloud_megabytes"] == round(cloud.nbytes / 1e6, 1) > 0
 
 
 def test_far_coordinates_lose_nothing() -> None:

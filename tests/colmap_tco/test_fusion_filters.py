@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from colmap_tco.errors import DensifyError
 from colmap_tco.fusion import FusionConfig, FusionView, fuse
 from colmap_tco.fusion_report import FusionReport
 from colmap_tco.ply import Cloud
-from tests.colmap_tco.test_fusion import CONFIG, DISTANCE, SIZE, Scene, sphere
+from tests.colmap_tco.test_fusion import CONFIG, DISTANCE, SIZE, Scene, smooth_noise, sphere
 
 Floats = NDArray[np.float64]
 BOX = (-0.3, -0.5, -2.0, 0.6, 0.4, 2.0)
@@ -97,6 +98,46 @@ def test_background_beyond_the_points_of_the_model_is_dropped() -> None:
         cloud, report = fuse(views, off)
         assert report.pixels["max_depth_ratio"] == 0
         assert cloud.points[:, 2].max() > BEHIND - 1
+
+
+FRONT, BACK = -0.7, 0.6
+
+
+def step(origin: Floats, directions: Floats) -> Floats:
+    """A wall at z = BACK, and left of x = 0 a plate before it at z = FRONT."""
+    front = (FRONT - origin[2]) / directions[..., 2]
+    back = (BACK - origin[2]) / directions[..., 2]
+    return np.where(origin[0] + directions[..., 0] * front < 0, front, back)
+
+
+@pytest.mark.parametrize("width", [0.7, 1.0, 2.0])
+def test_smeared_edges_leave_no_points_between_the_surfaces(width: float) -> None:
+    """With the default settings, where every view has a ramp of some pixels between plate and wall."""
+
+    def smear(i: int, depth: Floats) -> Floats:
+        return gaussian_filter(depth * (1 + smooth_noise(i, depth.shape, 0.003)), width)
+
+    def away(config: FusionConfig) -> Floats:
+        cloud, _ = fuse(Scene(step, count=9, disturb=smear).views(), config)
+        assert len(cloud) > 5000
+        return np.minimum(np.abs(cloud.points[:, 2] - FRONT), np.abs(cloud.points[:, 2] - BACK))
+
+    bound = 2 * 0.01 * DISTANCE  # twice the tolerance; plate and wall are 1.3 apart
+    assert away(FusionConfig(num_threads=1)).max() < bound
+    none = FusionConfig(
+        num_threads=1, max_depth_bend=0.0, max_view_angle=90.0, max_conflicts=0.0, max_normal_error=60.0,
+        min_num_pixels=2,
+    )  # fmt: skip
+    assert width < 2 or (away(none) > bound).sum() > 100
+
+
+def test_an_empty_result_names_the_conflicts() -> None:
+    """Each surface is a tenth farther than that of the view before: later views look through earlier ones."""
+    views = Scene(disturb=lambda i, depth: depth * 1.1**i).views()
+    with pytest.raises(
+        DensifyError, match=r"dropped because other views look through them \(max_conflicts\)"
+    ):
+        fuse(views, CONFIG)
 
 
 def widest_angle(cloud: Cloud, point: int, by_index: dict[int, Floats]) -> float:

@@ -16,7 +16,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from colmap_tco import _pycolmap
+from colmap_tco import _pycolmap, scene
 from colmap_tco.errors import InputError
 from colmap_tco.fusion import FusionConfig, fuse
 from colmap_tco.maps import read_map
@@ -26,6 +26,7 @@ from colmap_tco.outputs import (
     fusion_views,
     no_finer,
     plain,
+    reaches,
     read_view,
     undistorted_model,
     write_cloud,
@@ -37,6 +38,7 @@ from colmap_tco.outputs import (
 )
 from colmap_tco.ply import read_ply, read_vis
 from colmap_tco.resume import Result, fingerprint, open_result
+from colmap_tco.tracks import Observations, Tracks, read_tracks
 from colmap_tco.views import View, ViewConfig, make_views
 from colmap_tco.workspace import DensePaths, Workspace, dense_paths, open_workspace, partial_paths
 from tests.programs import imported_open3d
@@ -286,6 +288,41 @@ def test_stereo_fusion_gives_our_surface_half_a_pixel_aside(made: Made, tmp_path
     assert np.quantile(distance, 0.95) < 1.2 * PIXEL
     assert (their_normals * our_normals[nearest]).sum(1).min() > np.cos(np.radians(2))
     assert np.median(np.abs(their_colours.astype(int) - our_colours[nearest])) < 30
+
+
+def test_views_reach_as_far_as_nearly_all_of_their_points(made: Made) -> None:
+    """Of depths 1, 2, … 101 the 98th percentile is 99; other images' points do not count, nor do a few."""
+    some, few, none = (replace(view, cam_from_world=look_along_x()) for view in made.views[:3])
+    x = np.concatenate([np.arange(1.0, 102.0), np.full(50, 1e6)])
+    xyz = np.stack([x, 3 * x, -x], 1) + (10.0, 0.0, 0.0)
+    seen = {some.image_id: np.arange(101), few.image_id: np.arange(9), none.image_id: np.arange(0)}
+    images = {key: Observations(np.zeros((len(p), 2)), p, np.zeros(len(p))) for key, p in seen.items()}
+    tracks = Tracks(np.arange(len(x)), xyz, np.zeros((len(x), 3, 3)), np.full(len(x), 2), images, {}, {})
+    assert reaches(tracks, [some, few, none]) == {some.name: pytest.approx(99.0)}
+
+
+def look_along_x() -> Floats:
+    """cam_from_world of a camera at x = 10."""
+    return np.array([[0.0, 0, -1, 0], [0, -1, 0, 0], [1, 0, 0, -10]])
+
+
+def test_views_for_the_fusion_know_how_far_they_reach(made: Made) -> None:
+    """From files and in memory; and the fusion drops what lies farther than that many times."""
+    tracks = read_tracks(made.workspace.model)
+    reach = reaches(tracks, made.views)
+    assert set(reach) == set(names())
+    neighbours = {view.name: [o.name for o in made.views if o is not view] for view in made.views}
+    indices = {view.name: i for i, view in enumerate(made.views)}
+    from_files = fusion_views(made.paths, made.views, neighbours, indices, reach)
+    sources = [[j for j in range(COUNT) if j != i] for i in range(COUNT)]
+    in_memory = scene.fusion_views(made.views, [maps_of(view) for view in made.views], sources, tracks)
+    config = FusionConfig(min_num_pixels=3, num_threads=1, max_depth_ratio=0.9)
+    for views in (from_files, in_memory):
+        assert {view.name: view.reach for view in views} == reach
+        far = sum(int((view.load().depth > 0.9 * view.reach).sum()) for view in views)
+        assert fuse(views, config)[1].pixels["max_depth_ratio"] == far > 1000
+    unbound = fusion_views(made.paths, made.views, neighbours, indices)
+    assert all(view.reach == np.inf for view in unbound)
 
 
 def test_visibility_counts_in_the_order_of_the_written_model(made: Made) -> None:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
+from collections.abc import Callable, Iterator
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -37,6 +40,44 @@ def random_cloud(count, seed=0):
 def lists(*images):
     start = np.cumsum([0, *(len(i) for i in images)])
     return Visibility(start, np.array([j for i in images for j in i], np.uint32))
+
+
+def traced(function: Callable[[], object]) -> int:
+    """Most bytes that were allocated at once while a function ran."""
+    tracemalloc.start()
+    try:
+        function()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def parts(count: int, size: int) -> Iterator[Cloud]:
+    """Clouds of ``size`` points, each seen by five images, that nobody else holds."""
+    rng = np.random.default_rng(0)
+    for _ in range(count):
+        yield Cloud(
+            rng.normal(size=(size, 3)),
+            np.ones((size, 3), np.float32),
+            np.zeros((size, 3), np.uint8),
+            Visibility(5 * np.arange(size + 1), np.arange(5 * size, dtype=np.uint32)),
+        )
+
+
+def test_joining_needs_the_memory_of_the_cloud_and_of_its_largest_array() -> None:
+    """24 of 67 bytes; both copies at once would be twice the cloud."""
+    whole = 20 * 10_000 * (47 + 4 * 5) + 8
+    assert join(parts(20, 10_000)).nbytes == whole
+    assert traced(lambda: join(parts(20, 10_000))) < 1.45 * whole
+
+
+def test_writing_needs_the_memory_of_a_block(tmp_path: Path) -> None:
+    size = 800_000
+    points, colors = np.zeros((size, 3)), np.zeros((size, 3), np.uint8)
+    normals = np.zeros((size, 3), np.float32)
+    peak = traced(lambda: write_ply(tmp_path / "c.ply", points, normals, colors))
+    assert (tmp_path / "c.ply").stat().st_size > 27 * size
+    assert peak < 0.5 * 27 * size
 
 
 def test_layout():

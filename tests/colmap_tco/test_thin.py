@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from colmap_tco.errors import InputError
 from colmap_tco.ply import Cloud, Visibility
 from colmap_tco.thin import thin
 
@@ -89,7 +90,7 @@ def test_moving_the_model_moves_the_result() -> None:
 
 
 def test_cubes_too_small_to_count_are_refused() -> None:
-    with pytest.raises(ValueError, match="voxel_size 1e-12 is too small"):
+    with pytest.raises(InputError, match="voxel_size 1e-12 is too small"):
         thin(uneven(), 1e-12)
 
 
