@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -621,17 +620,9 @@ def test_a_folder_of_bare_images_is_mapped_first(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def command() -> Iterator[Callable[..., int]]:
-    """The command line inside this process; the logging that it sets up is undone."""
-    root = logging.getLogger()
-    handlers, level = list(root.handlers), root.level
-    levels = {name: logging.getLogger(name).level for name in ("colmap_tco", "tco")}
-    yield lambda *words: main([*words])
-    logging.captureWarnings(False)
-    root.handlers[:] = handlers
-    root.setLevel(level)
-    for name, before in levels.items():
-        logging.getLogger(name).setLevel(before)
+def command(same_logging: None) -> Callable[..., int]:
+    """The command line inside this process."""
+    return lambda *words: main([*words])
 
 
 def test_exit_code_0_and_the_summary(
