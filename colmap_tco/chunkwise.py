@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -56,6 +57,7 @@ def predict_chunks(
     Returns:
         Name → why a view could not be predicted.
     """
+    start = time.monotonic()
     todo = [c for c in plan.chunks if not all(result.is_done(scene.views[i].name) for i in c.owned)]
     progress.stage("optimisation", sum(len(c.owned) for c in todo))
     if not todo:
@@ -88,9 +90,11 @@ def predict_chunks(
                     "owned": len(owned),
                     "reduced": attempt.chunk not in plan.chunks,
                     "agreement": attempt.result.agreement,
+                    "seconds": time.monotonic() - start,
                     "loss": outputs.plain(attempt.result.history),
                 }
             )
+            start = time.monotonic()
             progress.reach(sum(result.is_done(scene.views[i].name) for c in todo for i in c.owned))
     return failed
 

@@ -89,7 +89,7 @@ def exit_code(error: BaseException) -> int:
 
 
 def configure_logging(verbosity: int, log_json: bool) -> None:
-    """Send log records to stderr: warnings below 0, INFO of this project at 0, DEBUG above.
+    """Send log records to stderr: warnings below 0, INFO of this project at 0, DEBUG and COLMAP's log above.
 
     With ``log_json`` each record is one JSON object on a line, with ``time`` (UTC, ISO 8601),
     ``level``, ``logger``, ``message`` and what the record's ``data`` holds.
@@ -101,6 +101,9 @@ def configure_logging(verbosity: int, log_json: bool) -> None:
     level = logging.DEBUG if verbosity > 0 else logging.INFO if verbosity == 0 else logging.WARNING
     for package in ("colmap_tco", "tco"):
         logging.getLogger(package).setLevel(level)
+    # COLMAP writes to stderr by itself, and not in JSON.
+    talkative = verbosity > 0 and not log_json
+    logging.getLogger("pycolmap").setLevel(logging.INFO if talkative else logging.WARNING)
 
 
 class _TextFormatter(logging.Formatter):

@@ -18,20 +18,23 @@ import numpy as np
 import pytest
 
 from colmap_tco import _pycolmap
-from colmap_tco.backbones import NetworkConfig
+from colmap_tco.backbones import NetworkConfig, select
 from colmap_tco.chunks import plan_chunks
 from colmap_tco.cli import main
 from colmap_tco.densify import Densified, DensifyConfig, densify
 from colmap_tco.errors import InputError, PartlyDoneError
+from colmap_tco.fusion import FusionConfig
 from colmap_tco.lock import locked
+from colmap_tco.mapping import MappingConfig
 from colmap_tco.maps import read_map
-from colmap_tco.outputs import read_view
+from colmap_tco.origin import origin_of
+from colmap_tco.outputs import plain, read_view
 from colmap_tco.ply import read_ply, read_vis
 from colmap_tco.priors import PriorConfig, held_out
 from colmap_tco.progress import Progress
 from colmap_tco.tracks import covisibility, read_tracks
 from colmap_tco.views import ViewConfig
-from colmap_tco.workspace import DensePaths, open_workspace
+from colmap_tco.workspace import DensePaths, WorkspaceConfig, open_workspace
 from tco.options import ConsensusConfig, PolishConfig, TCOConfig
 
 if TYPE_CHECKING:
@@ -225,6 +228,53 @@ def test_a_second_run_says_that_all_is_done_and_changes_nothing(done: Done) -> N
     assert bytes_of(done.room.root, besides=()) == before
 
 
+def test_a_copy_of_a_workspace_is_complete_too(done: Done, tmp_path: Path) -> None:
+    """With files of another time, and where a model is there, however one would have been made."""
+    import shutil
+
+    root = tmp_path / "elsewhere"
+    shutil.copytree(done.room.root, root, copy_function=shutil.copyfile)
+    assert not made(root, config(steps=2)).fresh
+    settings = config(
+        steps=2,
+        mapping=MappingConfig(mapper="global", matcher="sequential"),
+        workspace=WorkspaceConfig(image_path=str(root / "images"), model_path=str(root / "sparse" / "0")),
+    )
+    assert not made(root, settings).fresh
+    picture = root / "images" / done.room.names[1]
+    picture.write_bytes((root / "images" / done.room.names[2]).read_bytes())
+    with pytest.raises(InputError, match=f"other inputs .picture {done.room.names[1]}.; give --overwrite"):
+        made(root, config(steps=2))
+
+
+def test_the_device_counts_and_not_how_it_was_named(done: Done) -> None:
+    import torch
+
+    if torch.cuda.is_available():
+        pytest.skip("auto is another device here")
+    settings = config(steps=2)
+    auto = replace(settings, network=replace(settings.network, device="auto", backbone="sweep"))
+    assert not made(done.room.root, auto).fresh
+
+
+def test_boxes_in_map_coordinates_are_told_apart(done: Done) -> None:
+    """Two that differ by 3 m at 5400 km, and the report has them to the last digit."""
+    box = (499_000.0, 5_399_000.0, 0.0, 501_000.0, 5_401_001.25, 900.0)
+    far = (*box[:4], box[4] + 3, box[5])
+    origins = [
+        origin_of(
+            open_workspace(done.room.root),
+            (),
+            config(fusion=FusionConfig(roi=roi)),
+            select(NetworkConfig(device="cpu")),
+        )
+        for roi in (box, far)
+    ]
+    assert not origins[0].same_result(origins[1]) and origins[0].same_maps(origins[1])
+    assert origins[1].settings["roi"] == list(far)
+    assert plain({"settings": FusionConfig(roi=far)})["settings"]["roi"] == list(far)  # type: ignore[index]
+
+
 @pytest.mark.parametrize("changes", [{"seed": 1}, {"priors": PriorConfig(holdout=0.2)}])
 def test_other_settings_do_not_replace_a_result_by_themselves(done: Done, changes: dict[str, Any]) -> None:
     before = bytes_of(done.room.root, besides=())
@@ -415,6 +465,10 @@ def test_other_settings_of_the_fusion_keep_the_depth_maps(fresh_room: Room) -> N
         assert (now.st_ino, now.st_mtime_ns) == (status.st_ino, status.st_mtime_ns)
     assert second.report["points"] > first.report["points"]
     assert second.report["loss"] == first.report["loss"]
+    spent = [run.report["seconds"]["optimisation"] for run in (first, second)]
+    assert (
+        spent[0] == spent[1] == pytest.approx(first.report["chunks"][0]["seconds"], rel=1e-5) and spent[0] > 0
+    )
     assert len(first.report["loss"][0]) == settings.tco.all_steps(len(fresh_room.names))
     assert second.report["views"] == first.report["views"]
     assert not made(fresh_room.root, loose).fresh
@@ -676,11 +730,9 @@ def test_an_existing_result_is_kept_and_completed_within_a_region(fresh_room: Ro
     """COLMAP's undistorted cameras with true depths in the upper half; the cloud cut and thinned."""
     from colmap_tco import _pycolmap
     from colmap_tco.fill import FillConfig
-    from colmap_tco.fusion import FusionConfig
     from colmap_tco.maps import write_map
     from colmap_tco.normals import normals_from_depth
     from colmap_tco.pinhole import Pinhole
-    from colmap_tco.workspace import DensePaths
 
     root, dense = fresh_room.root, DensePaths(fresh_room.root / "dense")
     dense.root.mkdir()
