@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import logging
+import re
 import sqlite3
+import time
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from colmap_tco import _pycolmap
+from colmap_tco import _pycolmap, mapping
+from colmap_tco.cli import configure_logging
 from colmap_tco.errors import InputError
 from colmap_tco.mapping import (
     MappingConfig,
@@ -18,6 +22,7 @@ from colmap_tco.mapping import (
     largest_descriptors,
     similarity,
 )
+from colmap_tco.progress import Progress
 from colmap_tco.workspace import find_models, open_workspace
 
 SIZE = (288, 216)
@@ -88,6 +93,58 @@ def test_bare_pictures_become_a_workspace(mapped: Path) -> None:
     centres = np.stack([-e.cam_from_world[:, :3].T @ e.cam_from_world[:, 3] for e in workspace.images])
     steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     assert steps / steps.mean() == pytest.approx(np.ones(4), abs=0.1)
+
+
+def test_every_phase_says_what_it_found_and_moves_the_bar(
+    pictures: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "images").symlink_to(pictures)
+    progress = Progress(interval=0.0)
+    with caplog.at_level(logging.INFO, "colmap_tco"):
+        ensure_model(tmp_path, num_threads=1, progress=progress)
+    told = [record.__dict__["data"] for record in caplog.records if "data" in record.__dict__]
+    furthest = {entry["stage"]: (entry["done"], entry["total"]) for entry in told}
+    assert list(furthest) == ["features", "matching", "mapping"]
+    assert list(furthest.values()) == [(5, 5), (10, 10), (5, 5)]
+    assert re.search(r"\d{4} features in 5 images", caplog.text)
+    assert "10 of 10 pairs of images match" in caplog.text
+
+
+def test_the_bar_follows_a_database_that_is_being_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a lock on it: whoever writes may take it as a whole at any time."""
+    monkeypatch.setattr(mapping, "LOOK_AGAIN", 0.002)
+    job = mapping._Job(tmp_path, [], tmp_path, 1, 0)
+    progress = Progress()
+    progress.stage("features", 40)
+    seen = []
+    with mapping._watched(job, "SELECT COUNT(*) FROM keypoints", progress):
+        writer = sqlite3.connect(job.database, isolation_level=None, timeout=0)
+        writer.execute("CREATE TABLE keypoints (rows INTEGER)")
+        for _ in range(40):
+            writer.execute("BEGIN EXCLUSIVE")
+            writer.execute("INSERT INTO keypoints VALUES (7)")
+            writer.execute("COMMIT")
+            time.sleep(0.005)
+            seen.append(progress.done)
+        writer.close()
+    assert seen == sorted(seen) and len(set(seen)) > 2
+    assert progress.done == 40
+
+
+@pytest.mark.parametrize(("verbosity", "log_json", "level"), [(0, False, 2), (1, False, 0), (1, True, 2)])
+def test_colmaps_own_log_is_shown_where_asked_for(
+    same_logging: None, verbosity: int, log_json: bool, level: int
+) -> None:
+    configure_logging(verbosity, log_json)
+    log = _pycolmap.load().logging
+    before = log.minloglevel
+    try:
+        _pycolmap.load.__wrapped__()
+        assert log.minloglevel == level
+    finally:
+        log.minloglevel = before
 
 
 def test_a_model_that_is_there_is_left_alone(mapped: Path) -> None:
