@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from colmap_tco import outputs
 from colmap_tco.attempts import within_memory
 from colmap_tco.backbones import Budget, Selected, load
 from colmap_tco.chunks import Chunk, ChunkPlan
+from colmap_tco.errors import UsageError
 from colmap_tco.fill import Existing, fill
 from colmap_tco.memory import release
 from colmap_tco.pictures import Pictures
@@ -25,6 +26,9 @@ from colmap_tco.resume import Result
 from colmap_tco.tracks import Covisibility, Tracks
 from colmap_tco.views import View
 from tco.options import ConsensusConfig, TCOConfig
+
+if TYPE_CHECKING:
+    from tco.backbones.base import Backbone
 
 log = logging.getLogger(__name__)
 
@@ -56,6 +60,9 @@ def predict_chunks(
 
     Returns:
         Name → why a view could not be predicted.
+
+    Raises:
+        UsageError: names of layers to be adapted that the network does not have.
     """
     start = time.monotonic()
     todo = [c for c in plan.chunks if not all(result.is_done(scene.views[i].name) for i in c.owned)]
@@ -63,7 +70,7 @@ def predict_chunks(
     if not todo:
         return {}
     chosen, budget, existing = means
-    backbone, failed = load(chosen), {}
+    backbone, failed = _loaded(chosen, settings[1]), {}
     if len(plan.chunks) > 1:
         log.info("%d views in %d overlapping chunks", sum(len(c.owned) for c in todo), len(todo))
     pictures = Pictures(lambda view, image: _write_picture(result, view, image))
@@ -97,6 +104,21 @@ def predict_chunks(
             start = time.monotonic()
             progress.reach(sum(result.is_done(scene.views[i].name) for c in todo for i in c.owned))
     return failed
+
+
+def _loaded(chosen: Selected, config: TCOConfig) -> Backbone:
+    """The network, if it has the layers that are to be adapted; the optimisation would find that out later."""
+    from tco.lora import LoRAConfig, adapted
+
+    backbone = load(chosen)
+    if not config.steps:
+        return backbone
+    names = LoRAConfig(targets=config.lora_targets, unfrozen=config.ablation.unfrozen)
+    try:
+        with adapted(backbone.decoder(), names):
+            return backbone
+    except ValueError as error:
+        raise UsageError(f"--lora_targets, --unfrozen: {error}") from error
 
 
 @contextmanager

@@ -18,19 +18,13 @@ from typing import Any, NoReturn
 
 from colmap_tco import flags
 from colmap_tco.commands import COMMANDS, Command
-from colmap_tco.errors import DensifyError, OutOfMemoryError, is_out_of_memory
+from colmap_tco.errors import DensifyError, OutOfMemoryError, UsageError, is_out_of_memory
 from colmap_tco.kernel_cache import ensure_kernel_cache
 from colmap_tco.progress import Progress
 
 logger = logging.getLogger(__name__)
 
 INTERRUPTED = 130
-
-
-class UsageError(DensifyError):
-    """A command line that cannot be understood."""
-
-    exit_code = 2
 
 
 class _Terminated(KeyboardInterrupt):

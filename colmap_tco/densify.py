@@ -35,7 +35,7 @@ from colmap_tco.resume import Result, open_result
 from colmap_tco.tracks import Covisibility, Tracks, covisibility, read_tracks
 from colmap_tco.views import View, ViewConfig, make_views
 from colmap_tco.workspace import Workspace, WorkspaceConfig, existing_root, find_models, open_workspace
-from tco.config import knob
+from tco.config import check_range, knob
 from tco.options import ConsensusConfig, TCOConfig
 
 log = logging.getLogger(__name__)
@@ -66,6 +66,9 @@ class DensifyConfig:
     workspace: WorkspaceConfig = field(default_factory=WorkspaceConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     given: tuple[str, ...] = given_flags()
+
+    def __post_init__(self) -> None:
+        check_range(self, "seed", 0, 2**31 - 1)  # what COLMAP takes
 
     @property
     def num_threads(self) -> int:

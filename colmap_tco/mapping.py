@@ -20,7 +20,7 @@ from colmap_tco._pycolmap import Ints
 from colmap_tco.errors import InputError, MissingError
 from colmap_tco.progress import Progress
 from colmap_tco.workspace import decoded_size, existing_root, find_images, find_models, list_images, listing
-from tco.config import knob
+from tco.config import check_range, knob
 
 log = logging.getLogger(__name__)
 
@@ -54,6 +54,10 @@ class MappingConfig:
         "per_image: one for each, for collections from unknown cameras",
         choices=("shared", "per_image"),
     )
+
+    def __post_init__(self) -> None:
+        check_range(self, "overlap", 1 if self.matcher == "sequential" else 0)
+        check_range(self, "num_similar", 1)
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,10 @@ class PriorConfig:
         0.1, "share of the tracks kept out of the optimisation, to measure the error on them; 0 uses all"
     )
 
+    def __post_init__(self) -> None:
+        if not 0 <= self.holdout < 1:
+            raise ValueError(f"holdout is a share of at least 0 and below 1, not {self.holdout}")
+
 
 @dataclass(frozen=True)
 class PriorSet:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from tco.config import knob
+from tco.config import POSITIVE, check_range, knob
 
 EVERY = 1_000_000
 """More than any chunk has views: every target, every source."""
@@ -44,6 +44,9 @@ class AblationConfig:
         "hold cameras by the paper's penalties (angle, normalised centres, focal lengths in pixels; weights "
         "1, 2 and 0.01) instead of by their uncertainty",
     )
+
+    def __post_init__(self) -> None:
+        check_range(self, "radius_factor free_rate", POSITIVE)
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,8 @@ class PolishConfig:
             raise ValueError("polish_looks must not be negative, and there must be a source and a level")
         if self.polish_smoothness < 0 or self.polish_consistency < 0:
             raise ValueError("polish_smoothness and polish_consistency are weights, not negative")
+        check_range(self, "polish_rate polish_uncertainty", 0)
+        check_range(self, "polish_levels", 1)
 
     def steps(self, views: int) -> int:
         """Steps that refine each of so many views as often as wanted."""
@@ -223,6 +228,12 @@ class TCOConfig:
             raise ValueError(f"point_dropout is a share below 1, not {self.point_dropout}")
         if self.stop_after > 0 and self.point_dropout == 0:
             raise ValueError("stop_after watches hidden points, and point_dropout 0 hides none")
+        check_range(self, "lora_rank", 1)
+        check_range(self, "lora_alpha clip consistency_tolerance", POSITIVE)
+        check_range(self, "structure consistency_start", 0, 1)
+        check_range(self, "photometric_weight geometric_weight depth_weight sparse_weight", 0)
+        check_range(self, "consistency_weight camera_weight rate camera_rate", 0)
+        check_range(self, "reencode stop_after occlusion_tolerance", 0)
 
     def reference_schedule(self) -> TCOConfig:
         """The same objective on the published schedule.

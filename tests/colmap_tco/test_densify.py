@@ -690,6 +690,35 @@ def test_exit_code_0_and_the_summary(
     assert "already made" in told.out and "nothing to do" in told.err
 
 
+@pytest.mark.parametrize(
+    ("flag", "value"),
+    [
+        ("--lora_rank", "0"), ("--lora_alpha", "0"), ("--rate", "-1"), ("--camera_rate", "-0.1"),
+        ("--holdout", "2"), ("--holdout", "1"), ("--holdout", "-0.1"), ("--polish_levels", "0"),
+        ("--polish_levels", "2,-1"), ("--polish_rate", "-1"), ("--structure", "7"), ("--structure", "-0.1"),
+        ("--clip", "-1"), ("--chunk_size", "-3"), ("--max_image_size", "-5"), ("--camera_weight", "-1"),
+        ("--consistency_start", "1.5"), ("--consistency_tolerance", "0"), ("--stop_after", "-1"),
+        ("--radius_factor", "0"), ("--seed", "-1"), ("--overlap", "-1"), ("--num_similar", "0"),
+        ("--kept_confidence", "0.5"), ("--reencode", "-1"),
+    ],
+)  # fmt: skip
+def test_exit_code_2_for_values_that_make_no_sense(
+    command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str], flag: str, value: str
+) -> None:
+    """Found out before the workspace is looked at, which is not there."""
+    assert command("densify", str(tmp_path / "nowhere"), f"{flag}={value}") == 2
+    assert flag.removeprefix("--") in capsys.readouterr().err
+
+
+def test_exit_code_2_for_layers_that_the_network_does_not_have(
+    command: Callable[..., int], fresh_room: Room, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("densify", str(fresh_room.root), *FLAGS, "--lora_targets", "conv,nonsense")
+    assert command(*words, "--steps", "1") == 2
+    assert "--lora_targets, --unfrozen: the target 'nonsense' fits no" in capsys.readouterr().err
+    assert not finished(fresh_room.root)
+
+
 def test_exit_code_3_without_images_or_folder(
     command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
