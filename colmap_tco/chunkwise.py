@@ -45,11 +45,12 @@ class Scene(NamedTuple):
 
 
 class Means(NamedTuple):
-    """What chunks are predicted with: the network, the memory for it, and depths to be completed, if any."""
+    """What chunks are predicted with: the network, the memory for it, depths to be completed, and threads."""
 
     chosen: Selected
     budget: Budget
     existing: Existing | None
+    num_threads: int = -1
 
 
 def predict_chunks(
@@ -69,7 +70,7 @@ def predict_chunks(
     progress.stage("optimisation", sum(len(c.owned) for c in todo))
     if not todo:
         return {}
-    chosen, budget, existing = means
+    chosen, budget, existing, threads = means
     backbone, failed = _loaded(chosen, settings[1]), {}
     if len(plan.chunks) > 1:
         log.info("%d views in %d overlapping chunks", sum(len(c.owned) for c in todo), len(todo))
@@ -79,7 +80,7 @@ def predict_chunks(
     def work(chunk: Chunk) -> ChunkResult:
         pace = Pace(chunk, settings[1], progress)
         return predict_chunk(
-            (backbone, device), scene.tracks, scene.views, chunk, settings, pace.step, pictures
+            (backbone, device), scene.tracks, scene.views, chunk, settings, pace.step, pictures, threads
         )
 
     with progress_told(result, len(scene.views)):
@@ -107,7 +108,7 @@ def predict_chunks(
 
 
 def _loaded(chosen: Selected, config: TCOConfig) -> Backbone:
-    """The network, if it has the layers that are to be adapted; the optimisation would find that out later."""
+    """The network, if it has the layers that are to be adapted; the optimisation would find out later."""
     from tco.lora import LoRAConfig, adapted
 
     backbone = load(chosen)

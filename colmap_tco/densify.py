@@ -134,19 +134,28 @@ def densify(
             the points of the model; also where an earlier run with these settings found so.
     """
     root = existing_root(root)
+    progress = progress or Progress()
     with locked(root):
-        done = _densify(root, config, progress or Progress())
+        bare = _begin(root, config, progress)  # before torch is imported, which takes seconds
+        with limited_threads(config.num_threads):
+            done = _densify(root, config, bare, progress)
     doubts = done.doubts()
     if doubts:
         raise PartlyDoneError("\n".join([done.summary(), *doubts]))
     return done
 
 
-def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified:
-    """The whole way, with the workspace locked."""
-    clock, bare = _Clock(), not config.workspace.model_path and not find_models(root)
+def _begin(root: Path, config: DensifyConfig, progress: Progress) -> bool:
+    """Plan the stages and begin the first; returns whether a model has to be made."""
+    bare = not config.workspace.model_path and not find_models(root)
     progress.plan({**(MAPPING_STAGES if bare else {}), **STAGES})
     progress.stage("pictures" if bare else "workspace", 1)
+    return bare
+
+
+def _densify(root: Path, config: DensifyConfig, bare: bool, progress: Progress) -> Densified:
+    """The whole way, with the workspace locked."""
+    clock = _Clock()
     with clock("workspace"):
         chosen = select(config.network)
         config = dataclasses.replace(config, tco=suited(config.tco, chosen.network, config.given))
@@ -171,8 +180,8 @@ def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified
     plan = plan_chunks(pairs.common, result.chunk_size(budget.views()))
     alone = {views[i].name: why for i, why in plan.skipped.items()}
     skipped = {**workspace.skipped, **skipped, **blind, **alone}
-    with clock("optimisation"), _threads(config.num_threads):
-        means = Means(chosen, budget, existing)
+    with clock("optimisation"):
+        means = Means(chosen, budget, existing, config.num_threads)
         settings = (config.priors, config.tco, config.consensus, config.seed)
         failed = predict_chunks(result, Scene(tracks, views, pairs), plan, means, settings, progress)
     used = _used(result, views, config.refine_cameras)
@@ -226,17 +235,20 @@ class _Clock:
 
 
 @contextmanager
-def _threads(count: int) -> Iterator[None]:
-    """Limit torch to a number of threads; a number that is not positive changes nothing."""
+def limited_threads(count: int) -> Iterator[None]:
+    """Limit torch and OpenCV to a number of threads; one that is not positive changes nothing."""
+    import cv2
     import torch
 
-    before = torch.get_num_threads()
+    before = torch.get_num_threads(), cv2.getNumThreads()
     if count > 0:
         torch.set_num_threads(count)
+        cv2.setNumThreads(count)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(before[0])
+        cv2.setNumThreads(before[1])
 
 
 def _map(root: Path, config: DensifyConfig, progress: Progress) -> None:

@@ -21,7 +21,7 @@ from colmap_tco import _pycolmap
 from colmap_tco.backbones import NetworkConfig, select
 from colmap_tco.chunks import plan_chunks
 from colmap_tco.cli import main
-from colmap_tco.densify import Densified, DensifyConfig, densify
+from colmap_tco.densify import Densified, DensifyConfig, densify, limited_threads
 from colmap_tco.errors import InputError, PartlyDoneError
 from colmap_tco.fusion import FusionConfig
 from colmap_tco.lock import locked
@@ -30,12 +30,15 @@ from colmap_tco.maps import read_map
 from colmap_tco.origin import origin_of
 from colmap_tco.outputs import plain, read_view
 from colmap_tco.ply import read_ply, read_vis
+from colmap_tco.predict import view_maps
 from colmap_tco.priors import PriorConfig, held_out
 from colmap_tco.progress import Progress
+from colmap_tco.scene import open_scene
 from colmap_tco.tracks import covisibility, read_tracks
 from colmap_tco.views import ViewConfig
 from colmap_tco.workspace import DensePaths, WorkspaceConfig, open_workspace
 from tco.options import ConsensusConfig, PolishConfig, TCOConfig
+from tco.types import Prediction
 
 if TYPE_CHECKING:
     from tests.conftest import Room
@@ -209,6 +212,30 @@ def test_the_report_says_what_was_done(done: Done) -> None:
     assert {"python", "pycolmap", "torch", "numpy"} <= report["versions"].keys()
     assert report["device"] == "cpu"
     assert report["workspace"]["model"].endswith("sparse/0")
+
+
+def test_a_number_of_threads_binds_all_who_have_their_own(room: Room) -> None:
+    """Torch and OpenCV while the run lasts, and the loops over pixels: with one, no thread is begun."""
+    import threading
+
+    import cv2
+    import torch
+
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    with limited_threads(1):
+        assert (torch.get_num_threads(), cv2.getNumThreads()) == (1, 1)
+    assert (torch.get_num_threads(), cv2.getNumThreads()) == before
+
+    scene = open_scene(room.root, ViewConfig(max_image_size=160))
+    view, valid = scene.images[0], scene.views.valid
+    assert view.network.height > 64  # more rows than a thread takes at a time
+    flat = Prediction(torch.ones(valid.shape), torch.ones(valid.shape), scene.priors.cameras, (0,))
+    begun: list[str] = []
+    for threads in (1, 2):
+        threading.setprofile(lambda *_: begun.append(threading.current_thread().name))
+        view_maps(view, flat, 0, valid, 1.0, num_threads=threads)
+        threading.setprofile(None)
+        assert bool(begun) == (threads == 2)
 
 
 def test_the_summary_names_the_cloud_and_the_quality(done: Done) -> None:
