@@ -127,8 +127,10 @@ def densify(
     that is logged.
 
     Raises:
-        InputError: images, model or masks that cannot be used, a result with other settings is there, or
-            another run is working on the workspace.
+        InputError: images, model or masks that cannot be used, a result or finished views with other
+            settings are there, or another run is working on the workspace.
+        UsageError: the network lacks layers that the settings name.
+        OutOfMemoryError: not even two views fit.
         MissingError: no such device or weights.
         PartlyDoneError: everything was written, but some views had to be left out, or the depths contradict
             the points of the model; also where an earlier run with these settings found so.

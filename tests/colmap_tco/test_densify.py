@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from colmap_tco import _pycolmap
+from colmap_tco import _pycolmap, chunkwise
 from colmap_tco.backbones import NetworkConfig, select
 from colmap_tco.chunks import plan_chunks
 from colmap_tco.cli import main
@@ -754,6 +754,20 @@ def test_exit_code_3_without_images_or_folder(
     assert command("densify", str(tmp_path)) == 3
     assert "no pictures" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_exit_code_4_where_not_even_two_views_fit(
+    command: Callable[..., int], fresh_room: Room, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Every chunk asks for more memory than any machine has; nothing is published."""
+    import torch
+
+    monkeypatch.setattr(chunkwise, "predict_chunk", lambda *_: torch.empty(1 << 60, dtype=torch.uint8))
+    assert command("densify", str(fresh_room.root), *FLAGS, "--steps", "0") == 4
+    told = capsys.readouterr().err
+    assert "on with 3" in told and "not even two views fit the memory" in told and "--max_image_size" in told
+    assert not (fresh_room.root / "dense-tco").exists()
 
 
 @pytest.mark.parametrize(
