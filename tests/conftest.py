@@ -36,7 +36,17 @@ DISTORTIONS = {
     "FOV": [0.8],
     "THIN_PRISM_FISHEYE": [0.01, -0.01, 0.001, 0.001, 0.0, 0.0, 0.001, 0.001],
 }
-"""Every distorting camera model that all supported versions of pycolmap know, with telling parameters."""
+"""Every camera model that a pinhole can stand for, with telling parameters; those that the version knows."""
+
+NEWER = {
+    "RAD_TAN_THIN_PRISM_FISHEYE": [0.01, -0.01, 0, 0, 0, 0, 0.001, 0.001, 0.001, 0.001, -0.001, 0.001],
+    "SIMPLE_DIVISION": [-0.1],
+    "DIVISION": [0.08],
+    "SIMPLE_FISHEYE": [],
+    "FISHEYE": [],
+    "EUCM": [0.4, 1.1],
+}
+DISTORTIONS |= {k: v for k, v in NEWER.items() if hasattr(_pycolmap.load().CameraModelId, k)}
 
 
 @dataclass(frozen=True)
