@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 import re
+import shutil
 import sqlite3
 import time
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -93,6 +95,48 @@ def test_bare_pictures_become_a_workspace(mapped: Path) -> None:
     centres = np.stack([-e.cam_from_world[:, :3].T @ e.cam_from_world[:, 3] for e in workspace.images])
     steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     assert steps / steps.mean() == pytest.approx(np.ones(4), abs=0.1)
+
+
+def compared(root: Path) -> set[tuple[int, int]]:
+    """Pairs of pictures, as they are numbered in their names, that were matched."""
+    with closing(sqlite3.connect(root / "database.db")) as database:
+        names = dict(database.execute("SELECT image_id, name FROM images"))
+        pairs = database.execute("SELECT pair_id FROM two_view_geometries").fetchall()
+    # COLMAP's key of a pair: the smaller id times the largest possible, plus the other.
+    ids = [(pair // 2147483647, pair % 2147483647) for (pair,) in pairs]
+    found = [sorted(int(Path(names[i]).stem) for i in pair) for pair in ids]
+    return {(a, b) for a, b in found}
+
+
+def test_pictures_beside_the_model_to_be_and_neighbours_in_name_order(pictures: Path, tmp_path: Path) -> None:
+    """Bare pictures in the workspace itself; each is compared with the next alone, as in a video."""
+    for picture in pictures.iterdir():
+        shutil.copy(picture, tmp_path / picture.name)
+    ensure_model(tmp_path, config=MappingConfig(matcher="sequential", overlap=1), num_threads=1)
+    assert compared(tmp_path) == {(i, i + 1) for i in range(4)}
+    workspace = open_workspace(tmp_path)
+    assert workspace.image_folder == tmp_path
+    assert len(workspace.images) >= 4
+
+
+@pytest.mark.parametrize(("cameras", "expected"), [("shared", 2), ("per_image", 5)])
+def test_pictures_of_one_size_share_a_camera_or_not(
+    pictures: Path, tmp_path: Path, cameras: str, expected: int
+) -> None:
+    """Two of the five are smaller, as from another camera."""
+    (tmp_path / "images").mkdir()
+    for i in range(5):
+        picture = cv2.imread(str(pictures / f"{i}.png"))
+        if i in (1, 3):
+            picture = cv2.resize(picture, (240, 180), interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), picture)
+    ensure_model(tmp_path, config=MappingConfig(cameras=cameras), num_threads=1)
+    workspace = open_workspace(tmp_path)
+    assert len(workspace.images) == 5 and not workspace.skipped  # each of the size of its camera
+    assert len({entry.camera.camera_id for entry in workspace.images}) == expected
+    for entry in workspace.images:
+        small = entry.name in ("1.png", "3.png")
+        assert _pycolmap.camera_size(entry.camera) == ((240, 180) if small else SIZE)
 
 
 def test_every_phase_says_what_it_found_and_moves_the_bar(
