@@ -40,7 +40,7 @@ IN_THE_INPUTS = frozenset(
 )
 """Settings that say where the inputs are or how the model was made: what they led to counts, in its bytes."""
 
-FREE = frozenset({"given", "overwrite", "report_page", "num_threads"})
+FREE = frozenset({"given", "overwrite", "report_page", "num_threads", "cache_size"})
 """Settings that do not change the result."""
 
 _BLOCK = 1 << 20

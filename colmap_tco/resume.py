@@ -245,7 +245,7 @@ def _resume(partial: DensePaths, origin: Origin, overwrite: bool) -> _Record:
         begun = f"{partial.root} was begun {origin.difference(before)}"
         if views and not overwrite:
             raise InputError(
-                f"{begun}: the command of then goes on after its {len(views)} finished views, --overwrite "
+                f"{begun}: what it was begun with goes on after its {len(views)} finished views, --overwrite "
                 "begins anew without them"
             )
         log.info("%s: beginning anew", begun)
