@@ -6,10 +6,11 @@ Nothing else in this package imports it.
 
 from __future__ import annotations
 
+import logging
 import os
 import tempfile
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -30,13 +31,13 @@ Camera: TypeAlias = Any
 """A ``pycolmap.Camera``."""
 
 SPHERICAL = ("EQUIRECTANGULAR",)
-_QUIET, _TALKATIVE = 2, 0
 
 
 @cache
 def load() -> Any:
-    """The pycolmap module, imported after every other user of zlib and with its log kept to errors.
+    """The pycolmap module, imported after every other user of zlib.
 
+    Of its own log only errors come through, all of it where the logger ``pycolmap`` is enabled for INFO.
     The wheels of 4.1.1 and later bring a zlib of their own. Whoever binds zlib's symbols after them
     gets theirs, and PNG writing (Pillow, OpenCV), ``np.savez_compressed`` and gzip abort the process;
     imported before, each keeps the zlib that it was built with.
@@ -51,7 +52,8 @@ def load() -> Any:
 
     import pycolmap
 
-    pycolmap.logging.minloglevel = _QUIET
+    talkative = logging.getLogger("pycolmap").isEnabledFor(logging.INFO)
+    pycolmap.logging.minloglevel = 0 if talkative else 2  # glog's INFO and ERROR
     return pycolmap
 
 
@@ -59,11 +61,6 @@ def version() -> tuple[int, int]:
     """(major, minor) of the installed pycolmap."""
     major, minor = load().__version__.split(".")[:2]
     return int(major), int(minor)
-
-
-def set_verbose(verbose: bool) -> None:
-    """Let COLMAP's own log through to stderr, or only its errors."""
-    load().logging.minloglevel = _TALKATIVE if verbose else _QUIET
 
 
 def read_model(path: Path) -> Model:
@@ -358,7 +355,10 @@ def has_global_mapper() -> bool:
     return hasattr(load(), "global_mapping")
 
 
-def run_mapper(inputs: tuple[Path, Path], output: Path, use_global: bool, threads: int, seed: int) -> int:
+def run_mapper(
+    inputs: tuple[Path, Path], output: Path, use_global: bool, threads: int, seed: int,
+    registered: Callable[[], None] = lambda: None,
+) -> int:  # fmt: skip
     """Reconstruct into ``output``/0, 1, …
 
     Args:
@@ -367,6 +367,7 @@ def run_mapper(inputs: tuple[Path, Path], output: Path, use_global: bool, thread
         use_global: the global mapper instead of the incremental one.
         threads: -1 for all cores.
         seed: of the random generators, where the version has a setting.
+        registered: called whenever the incremental mapper has added an image, after its first two.
 
     Returns:
         The number of models that hold points.
@@ -379,7 +380,8 @@ def run_mapper(inputs: tuple[Path, Path], output: Path, use_global: bool, thread
         if hasattr(options, name):
             setattr(options, name, value)
     run = pycolmap.global_mapping if use_global else pycolmap.incremental_mapping
-    models = run(str(inputs[0]), str(inputs[1]), str(output), options=options)
+    told = {} if use_global else {"next_image_callback": registered}
+    models = run(str(inputs[0]), str(inputs[1]), str(output), options=options, **told)
     return sum(len(model.points3D) > 0 for model in models.values())
 
 

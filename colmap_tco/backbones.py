@@ -21,7 +21,7 @@ from colmap_tco.memory import (
 from colmap_tco.published import NETWORKS, PUBLISHED, Network
 from colmap_tco.views import View
 from colmap_tco.weights import accepted, cached, gigabytes, located, require
-from tco.config import knob
+from tco.config import check_range, knob
 from tco.options import TCOConfig
 
 if TYPE_CHECKING:
@@ -57,6 +57,9 @@ class NetworkConfig:
         "views that are optimised together; 0: as many as fit 70 % of the free memory, at most 128 with "
         "sweep and 40 with the others",
     )
+
+    def __post_init__(self) -> None:
+        check_range(self, "chunk_size", 0)
 
 
 class Selected(NamedTuple):

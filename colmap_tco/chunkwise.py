@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from colmap_tco import outputs
 from colmap_tco.attempts import within_memory
 from colmap_tco.backbones import Budget, Selected, load
 from colmap_tco.chunks import Chunk, ChunkPlan
+from colmap_tco.errors import UsageError
 from colmap_tco.fill import Existing, fill
 from colmap_tco.memory import release
 from colmap_tco.pictures import Pictures
@@ -24,6 +26,9 @@ from colmap_tco.resume import Result
 from colmap_tco.tracks import Covisibility, Tracks
 from colmap_tco.views import View
 from tco.options import ConsensusConfig, TCOConfig
+
+if TYPE_CHECKING:
+    from tco.backbones.base import Backbone
 
 log = logging.getLogger(__name__)
 
@@ -40,11 +45,12 @@ class Scene(NamedTuple):
 
 
 class Means(NamedTuple):
-    """What chunks are predicted with: the network, the memory for it, and depths to be completed, if any."""
+    """What chunks are predicted with: the network, the memory for it, depths to be completed, and threads."""
 
     chosen: Selected
     budget: Budget
     existing: Existing | None
+    num_threads: int = -1
 
 
 def predict_chunks(
@@ -55,13 +61,17 @@ def predict_chunks(
 
     Returns:
         Name → why a view could not be predicted.
+
+    Raises:
+        UsageError: names of layers to be adapted that the network does not have.
     """
+    start = time.monotonic()
     todo = [c for c in plan.chunks if not all(result.is_done(scene.views[i].name) for i in c.owned)]
     progress.stage("optimisation", sum(len(c.owned) for c in todo))
     if not todo:
         return {}
-    chosen, budget, existing = means
-    backbone, failed = load(chosen), {}
+    chosen, budget, existing, threads = means
+    backbone, failed = _loaded(chosen, settings[1]), {}
     if len(plan.chunks) > 1:
         log.info("%d views in %d overlapping chunks", sum(len(c.owned) for c in todo), len(todo))
     pictures = Pictures(lambda view, image: _write_picture(result, view, image))
@@ -70,7 +80,7 @@ def predict_chunks(
     def work(chunk: Chunk) -> ChunkResult:
         pace = Pace(chunk, settings[1], progress)
         return predict_chunk(
-            (backbone, device), scene.tracks, scene.views, chunk, settings, pace.step, pictures
+            (backbone, device), scene.tracks, scene.views, chunk, settings, pace.step, pictures, threads
         )
 
     with progress_told(result, len(scene.views)):
@@ -88,11 +98,28 @@ def predict_chunks(
                     "owned": len(owned),
                     "reduced": attempt.chunk not in plan.chunks,
                     "agreement": attempt.result.agreement,
+                    "seconds": time.monotonic() - start,
                     "loss": outputs.plain(attempt.result.history),
                 }
             )
+            start = time.monotonic()
             progress.reach(sum(result.is_done(scene.views[i].name) for c in todo for i in c.owned))
     return failed
+
+
+def _loaded(chosen: Selected, config: TCOConfig) -> Backbone:
+    """The network, if it has the layers that are to be adapted; the optimisation would find out later."""
+    from tco.lora import LoRAConfig, adapted
+
+    backbone = load(chosen)
+    if not config.steps:
+        return backbone
+    names = LoRAConfig(targets=config.lora_targets, unfrozen=config.ablation.unfrozen)
+    try:
+        with adapted(backbone.decoder(), names):
+            return backbone
+    except ValueError as error:
+        raise UsageError(f"--lora_targets, --unfrozen: {error}") from error
 
 
 @contextmanager

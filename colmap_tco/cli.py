@@ -18,19 +18,13 @@ from typing import Any, NoReturn
 
 from colmap_tco import flags
 from colmap_tco.commands import COMMANDS, Command
-from colmap_tco.errors import DensifyError, OutOfMemoryError, is_out_of_memory
+from colmap_tco.errors import DensifyError, OutOfMemoryError, UsageError, is_out_of_memory
 from colmap_tco.kernel_cache import ensure_kernel_cache
 from colmap_tco.progress import Progress
 
 logger = logging.getLogger(__name__)
 
 INTERRUPTED = 130
-
-
-class UsageError(DensifyError):
-    """A command line that cannot be understood."""
-
-    exit_code = 2
 
 
 class _Terminated(KeyboardInterrupt):
@@ -89,7 +83,7 @@ def exit_code(error: BaseException) -> int:
 
 
 def configure_logging(verbosity: int, log_json: bool) -> None:
-    """Send log records to stderr: warnings below 0, INFO of this project at 0, DEBUG above.
+    """Send log records to stderr: warnings below 0, INFO of this project at 0, DEBUG and COLMAP's log above.
 
     With ``log_json`` each record is one JSON object on a line, with ``time`` (UTC, ISO 8601),
     ``level``, ``logger``, ``message`` and what the record's ``data`` holds.
@@ -101,6 +95,9 @@ def configure_logging(verbosity: int, log_json: bool) -> None:
     level = logging.DEBUG if verbosity > 0 else logging.INFO if verbosity == 0 else logging.WARNING
     for package in ("colmap_tco", "tco"):
         logging.getLogger(package).setLevel(level)
+    # COLMAP writes to stderr by itself, and not in JSON.
+    talkative = verbosity > 0 and not log_json
+    logging.getLogger("pycolmap").setLevel(logging.INFO if talkative else logging.WARNING)
 
 
 class _TextFormatter(logging.Formatter):

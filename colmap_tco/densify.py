@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from colmap_tco import outputs, report
-from colmap_tco.backbones import Budget, NetworkConfig, Selected, select, suited
+from colmap_tco.backbones import Budget, NetworkConfig, select, suited
 from colmap_tco.chunks import plan_chunks, source_views
 from colmap_tco.chunkwise import Means, Scene, predict_chunks
 from colmap_tco.errors import InputError, OutOfMemoryError, PartlyDoneError
@@ -27,15 +27,16 @@ from colmap_tco.flags import given_flags
 from colmap_tco.fusion import EmptyCloudError, FusionConfig, fuse
 from colmap_tco.lock import locked
 from colmap_tco.mapping import MappingConfig, ensure_model
+from colmap_tco.origin import origin_of
 from colmap_tco.page.write import write_page
 from colmap_tco.pose_covariance import with_deviations
 from colmap_tco.priors import PriorConfig, with_points
 from colmap_tco.progress import Progress
-from colmap_tco.resume import Result, fingerprint, open_result
+from colmap_tco.resume import Result, open_result
 from colmap_tco.tracks import Covisibility, Tracks, covisibility, read_tracks
 from colmap_tco.views import View, ViewConfig, make_views
-from colmap_tco.workspace import Workspace, WorkspaceConfig, existing_root, open_workspace
-from tco.config import knob
+from colmap_tco.workspace import Workspace, WorkspaceConfig, existing_root, find_models, open_workspace
+from tco.config import check_range, knob
 from tco.options import ConsensusConfig, TCOConfig
 
 log = logging.getLogger(__name__)
@@ -66,6 +67,9 @@ class DensifyConfig:
     workspace: WorkspaceConfig = field(default_factory=WorkspaceConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     given: tuple[str, ...] = given_flags()
+
+    def __post_init__(self) -> None:
+        check_range(self, "seed", 0, 2**31 - 1)  # what COLMAP takes
 
     @property
     def num_threads(self) -> int:
@@ -124,30 +128,46 @@ def densify(
     that is logged.
 
     Raises:
-        InputError: images, model or masks that cannot be used, a result with other settings is there, or
-            another run is working on the workspace.
+        InputError: images, model or masks that cannot be used, a result or finished views with other
+            settings are there, or another run is working on the workspace.
+        UsageError: the network lacks layers that the settings name.
+        OutOfMemoryError: not even two views fit.
         MissingError: no such device or weights.
         PartlyDoneError: everything was written, but some views had to be left out, or the depths contradict
             the points of the model; also where an earlier run with these settings found so.
     """
     root = existing_root(root)
+    progress = progress or Progress()
     with locked(root):
-        done = _densify(root, config, progress or Progress())
+        bare = _begin(root, config, progress)  # before torch is imported, which takes seconds
+        with limited_threads(config.num_threads):
+            done = _densify(root, config, bare, progress)
     doubts = done.doubts()
     if doubts:
         raise PartlyDoneError("\n".join([done.summary(), *doubts]))
     return done
 
 
-def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified:
+def _begin(root: Path, config: DensifyConfig, progress: Progress) -> bool:
+    """Plan the stages and begin the first; returns whether a model has to be made."""
+    bare = not config.workspace.model_path and not find_models(root)
+    progress.plan({**(MAPPING_STAGES if bare else {}), **STAGES})
+    progress.stage("pictures" if bare else "workspace", 1)
+    return bare
+
+
+def _densify(root: Path, config: DensifyConfig, bare: bool, progress: Progress) -> Densified:
     """The whole way, with the workspace locked."""
     clock = _Clock()
-    progress.plan(STAGES)
     with clock("workspace"):
-        progress.stage("workspace", 1)
         chosen = select(config.network)
         config = dataclasses.replace(config, tco=suited(config.tco, chosen.network, config.given))
-        workspace = _open_or_map(root, config)
+    if bare:
+        with clock("mapping"):
+            _map(root, config, progress)
+        progress.stage("workspace", 1)
+    with clock("workspace"):
+        workspace = open_workspace(root, config.workspace, config.num_threads)
         views, skipped = make_views(workspace, config.views, chosen.network.stride, chosen.network.image_size)
         tracks = read_tracks(workspace.model, logging.INFO)
         if config.priors.pose_covariance:
@@ -156,15 +176,17 @@ def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified
         pairs = covisibility(tracks, [view.image_id for view in views])
         budget = Budget.of(chosen, views, config.network, config.tco.steps)
         existing = _existing(config, views)
-        key, maps = _fingerprints(workspace, views, config, chosen, existing)
-        result = open_result(root, key, config.overwrite, maps, outputs.plain(config))
+        origin = origin_of(workspace, views, config, chosen, existing)
+        result = open_result(root, origin, config.overwrite)
     if result.finished:
-        return Densified(result.paths.root, json.loads(result.paths.report.read_text("utf-8")), fresh=False)
+        return _finished(result)
+    if bare:
+        result.mark_mapping(clock.seconds["mapping"])
     plan = plan_chunks(pairs.common, result.chunk_size(budget.views()))
     alone = {views[i].name: why for i, why in plan.skipped.items()}
     skipped = {**workspace.skipped, **skipped, **blind, **alone}
-    with clock("optimisation"), _threads(config.num_threads):
-        means = Means(chosen, budget, existing)
+    with clock("optimisation"):
+        means = Means(chosen, budget, existing, config.num_threads)
         settings = (config.priors, config.tco, config.consensus, config.seed)
         failed = predict_chunks(result, Scene(tracks, views, pairs), plan, means, settings, progress)
     used = _used(result, views, config.refine_cameras)
@@ -172,25 +194,13 @@ def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified
         _nothing_used(skipped, failed)
     with clock("fusion"):
         figures = _fuse_and_write(result, workspace, used, (pairs, tracks), views, config, progress)
-    figures |= {
-        "views": report.view_table(
-            result, used, {"skipped": skipped, "failed": failed, "unregistered": workspace.unregistered}
-        ),
-        "images": {
-            "used": len(used),
-            "skipped": len(skipped),
-            "failed": len(failed),
-            "unregistered": len(workspace.unregistered),
-        },
+    left = {"skipped": skipped, "failed": failed, "unregistered": workspace.unregistered}
+    figures |= report.contents(result, used, left) | {
         "backbone": chosen.describe(),
-        "chunks": [{k: v for k, v in chunk.items() if k != "loss"} for chunk in result.chunks],
-        "held_out": report.held_out(result),
-        "loss": [chunk["loss"] for chunk in result.chunks],
         "workspace": {"model": workspace.model_path, "reasons": workspace.reasons},
         "settings": config,
-        "versions": report.versions(),
         "device": str(chosen.device),
-        "seconds": clock.seconds,
+        "seconds": result.seconds(clock.seconds),
     }
     progress.stage("report", 1)
     outputs.write_report(result.paths.report, figures)
@@ -200,11 +210,20 @@ def _densify(root: Path, config: DensifyConfig, progress: Progress) -> Densified
     return Densified(folder, json.loads((folder / "report.json").read_text("utf-8")), fresh=True)
 
 
-HASHED = 200_000_000
-"""Bytes below which a file of weights counts by its content, above by its size and time of change."""
+def _finished(result: Result) -> Densified:
+    """What an earlier run has made."""
+    told = json.loads(result.paths.report.read_text("utf-8"))
+    others = report.other_versions(told["versions"])
+    if others:
+        log.info("it was made with other versions (%s); --overwrite makes it anew", others)
+    return Densified(result.paths.root, told, fresh=False)
+
 
 STAGES = {"workspace": 3.0, "optimisation": 82.0, "fusion": 11.0, "report": 4.0}
 """Stages of a run and about how much of its time each takes."""
+
+MAPPING_STAGES = {"pictures": 2.0, "features": 15.0, "matching": 30.0, "mapping": 30.0}
+"""Stages before those where there is no model, in the same unit."""
 
 
 class _Clock:
@@ -217,60 +236,30 @@ class _Clock:
     def __call__(self, name: str) -> Iterator[None]:
         start = time.monotonic()
         yield
-        self.seconds[name] = time.monotonic() - start
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - start
 
 
 @contextmanager
-def _threads(count: int) -> Iterator[None]:
-    """Limit torch to a number of threads; a number that is not positive changes nothing."""
+def limited_threads(count: int) -> Iterator[None]:
+    """Limit torch and OpenCV to a number of threads; one that is not positive changes nothing."""
+    import cv2
     import torch
 
-    before = torch.get_num_threads()
+    before = torch.get_num_threads(), cv2.getNumThreads()
     if count > 0:
         torch.set_num_threads(count)
+        cv2.setNumThreads(count)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(before[0])
+        cv2.setNumThreads(before[1])
 
 
-def _open_or_map(root: Path, config: DensifyConfig) -> Workspace:
-    """The workspace; where it has no model, one is made of its images first."""
-    if not config.workspace.model_path:
-        ensure_model(root, config.workspace.image_path, config.mapping, config.num_threads, config.seed)
-    return open_workspace(root, config.workspace, config.num_threads)
-
-
-def _fingerprints(
-    workspace: Workspace,
-    views: Sequence[View],
-    config: DensifyConfig,
-    chosen: Selected,
-    existing: Existing | None,
-) -> tuple[str, str]:
-    """Two texts: one changes with everything that decides the result, one with what decides the maps."""
-    kept = dataclasses.replace(
-        config,
-        overwrite=False,
-        report_page=True,
-        given=(),
-        fusion=dataclasses.replace(config.fusion, num_threads=-1),
-    )
-    mapped = dataclasses.replace(kept, refine_cameras=False, fusion=FusionConfig())
-    masks = [view.mask_path for view in views if view.mask_path is not None]
-    model = [path for path in workspace.model_path.iterdir() if path.suffix in (".bin", ".txt")]
-    contents, told = [*model, *masks], {"versions": report.versions(), "network": chosen.network.name}
-    status = chosen.weights.stat()
-    if status.st_size < HASHED:
-        contents.append(chosen.weights)
-    else:
-        told["weights"] = f"{chosen.weights.name} {status.st_size} {status.st_mtime_ns}"
-    pictures = [view.path for view in views] + (existing.files() if existing else [])
-
-    def key(settings: DensifyConfig) -> str:
-        return fingerprint({"settings": outputs.plain(settings), **told}, contents, pictures)
-
-    return key(kept), key(mapped)
+def _map(root: Path, config: DensifyConfig, progress: Progress) -> None:
+    """Make a model of the images of a workspace that has none."""
+    images = config.workspace.image_path
+    ensure_model(root, images, config.mapping, config.num_threads, config.seed, progress)
 
 
 def _existing(config: DensifyConfig, views: Sequence[View]) -> Existing | None:

@@ -12,6 +12,12 @@ class DensifyError(Exception):
     exit_code = 1
 
 
+class UsageError(DensifyError):
+    """A command line or a setting that cannot be understood."""
+
+    exit_code = 2
+
+
 class InputError(DensifyError):
     """Images, model or masks that cannot be used as they are."""
 

@@ -25,7 +25,7 @@ from colmap_tco.outputs import ViewMaps
 from colmap_tco.pinhole import Pinhole
 from colmap_tco.views import View, map_mask
 from colmap_tco.workspace import DensePaths
-from tco.config import knob
+from tco.config import check_range, knob
 
 log = logging.getLogger(__name__)
 
@@ -49,6 +49,9 @@ class FillConfig:
         "confidence of the depths that fill_only keeps; that of the network's own is 1 to about 30. It is "
         "their weight where the fusion averages views.",
     )
+
+    def __post_init__(self) -> None:
+        check_range(self, "kept_confidence", 1)
 
     @property
     def sure(self) -> float:
@@ -84,8 +87,6 @@ def open_existing(config: FillConfig, views: Sequence[View]) -> Existing | None:
     """
     if not config.fill_only:
         return None
-    if not config.kept_confidence >= 1:
-        raise InputError(f"--kept_confidence is at least 1, not {config.kept_confidence}")
     paths = DensePaths(Path(config.fill_only))
     for folder in (paths.sparse, paths.stereo / "depth_maps"):
         if not folder.is_dir():

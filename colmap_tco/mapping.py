@@ -6,9 +6,11 @@ import logging
 import os
 import shutil
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event, Thread
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +18,16 @@ from numpy.typing import NDArray
 from colmap_tco import _pycolmap
 from colmap_tco._pycolmap import Ints
 from colmap_tco.errors import InputError, MissingError
+from colmap_tco.progress import Progress
 from colmap_tco.workspace import decoded_size, existing_root, find_images, find_models, list_images, listing
-from tco.config import knob
+from tco.config import check_range, knob
 
 log = logging.getLogger(__name__)
 
 EXHAUSTIVE_UP_TO = 150
 """Images up to which all pairs are matched: about ten thousand pairs."""
+LOOK_AGAIN = 0.5
+"""Seconds after which it is looked again how far COLMAP is."""
 _BLOCK = 64
 
 
@@ -50,6 +55,10 @@ class MappingConfig:
         choices=("shared", "per_image"),
     )
 
+    def __post_init__(self) -> None:
+        check_range(self, "overlap", 1 if self.matcher == "sequential" else 0)
+        check_range(self, "num_similar", 1)
+
 
 @dataclass(frozen=True)
 class _Job:
@@ -72,6 +81,7 @@ def ensure_model(
     config: MappingConfig = MappingConfig(),
     num_threads: int = -1,
     seed: int = 0,
+    progress: Progress | None = None,
 ) -> list[Path]:
     """The sparse models of a workspace; made from its images if there are none.
 
@@ -84,6 +94,7 @@ def ensure_model(
         config: how to map.
         num_threads: -1 for all cores.
         seed: with one thread the result is repeatable; with several it is nearly so.
+        progress: is told of the stages features, matching and mapping.
 
     Raises:
         InputError: fewer than two readable images, ``sparse`` in the way, or no reconstruction.
@@ -109,7 +120,7 @@ def ensure_model(
     shutil.rmtree(scratch, ignore_errors=True)
     (scratch / "sparse").mkdir(parents=True)
     log.info("no sparse model in %s: mapping %d images of %s", root, len(names), folder)
-    _reconstruct(_Job(folder, names, scratch, num_threads, seed), config)
+    _reconstruct(_Job(folder, names, scratch, num_threads, seed), config, progress or Progress())
     if (root / "database.db").exists():
         log.info("%s is left as it is", root / "database.db")
     else:
@@ -159,25 +170,85 @@ def _camera_groups(job: _Job) -> list[list[str]]:
     return list(groups.values())
 
 
-def _reconstruct(job: _Job, config: MappingConfig) -> None:
+def _reconstruct(job: _Job, config: MappingConfig, progress: Progress) -> None:
+    progress.stage("features", len(job.names))
     share = config.cameras == "shared"
-    for names in _camera_groups(job) if share else [job.names]:
-        _pycolmap.extract_features(job.database, job.folder, names, share, job.threads, job.seed)
+    with _watched(job, "SELECT COUNT(*) FROM keypoints", progress):
+        for names in _camera_groups(job) if share else [job.names]:
+            _pycolmap.extract_features(job.database, job.folder, names, share, job.threads, job.seed)
+    log.info("%d features in %d images", _asked(job, "SELECT SUM(rows) FROM keypoints"), len(job.names))
     _require_features(job)
-    matcher = _choose_matcher(config.matcher, len(job.names))
-    log.info("matching: %s", matcher)
-    if matcher == "retrieval":
-        pairs = _retrieve(job, config)
-        _pycolmap.match_pairs(job.database, pairs, job.threads, job.seed)
-    else:
-        overlap = config.overlap if matcher == "sequential" else None
-        _pycolmap.match(job.database, job.threads, job.seed, overlap)
+    _match(job, config, progress)
+    progress.stage("mapping", len(job.names))
     inputs, output = (job.database, job.folder), job.scratch / "sparse"
-    if not _pycolmap.run_mapper(inputs, output, config.mapper == "global", job.threads, job.seed):
+
+    def registered() -> None:
+        progress.advance(1 if progress.done else 3)  # the first two come without a call
+
+    use_global = config.mapper == "global"
+    if not _pycolmap.run_mapper(inputs, output, use_global, job.threads, job.seed, registered):
         raise InputError(
             f"{job.folder}: COLMAP found no reconstruction in {len(job.names)} images. They need texture, "
             "much overlap, and a camera that moves sideways; --matcher exhaustive tries all pairs."
         )
+
+
+def _match(job: _Job, config: MappingConfig, progress: Progress) -> None:
+    """Match the features of all pairs, or of those that are likely to overlap."""
+    matcher, count = _choose_matcher(config.matcher, len(job.names)), len(job.names)
+    pairs, overlap, total = None, None, count * (count - 1) // 2
+    if matcher == "retrieval":
+        pairs = _retrieve(job, config)
+        total = len(pairs.read_text("utf-8").splitlines())
+    elif matcher == "sequential":
+        overlap, total = config.overlap, min(total, config.overlap * count)
+    log.info("matching: %s", matcher)
+    progress.stage("matching", total)
+    with _watched(job, "SELECT COUNT(*) FROM two_view_geometries", progress):
+        if pairs:
+            _pycolmap.match_pairs(job.database, pairs, job.threads, job.seed)
+        else:
+            _pycolmap.match(job.database, job.threads, job.seed, overlap)
+    told = [_asked(job, f"SELECT COUNT(*) FROM two_view_geometries{x}") for x in (" WHERE rows > 0", "")]
+    log.info("%d of %d pairs of images match", *told)
+
+
+@contextmanager
+def _watched(job: _Job, query: str, progress: Progress) -> Iterator[None]:
+    """Tell the progress, now and then, how many rows of the database COLMAP has written.
+
+    COLMAP works in this thread, the only one that Ctrl-C reaches; another looks. It reads what lies on the
+    disk, some megabytes behind, and takes no locks: COLMAP aborts the process where it finds one.
+    """
+    over = Event()
+
+    def look() -> None:
+        while not over.wait(LOOK_AGAIN):
+            count = _asked(job, query, "immutable=1")
+            if count > progress.done:
+                progress.reach(count)
+
+    watcher = Thread(target=look, daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        over.set()
+        watcher.join()
+    progress.reach(_asked(job, query))
+
+
+def _asked(job: _Job, query: str, how: str = "mode=ro") -> int:
+    """The number that the database answers; 0 while it cannot, since it is being written."""
+    try:
+        with closing(_read_only(job.database, how)) as connection:
+            return int(connection.execute(query).fetchone()[0] or 0)
+    except sqlite3.DatabaseError:
+        return 0
+
+
+def _read_only(database: Path, how: str = "mode=ro") -> sqlite3.Connection:
+    return sqlite3.connect(f"{database.absolute().as_uri()}?{how}", uri=True)
 
 
 def _require_features(job: _Job) -> None:
@@ -222,8 +293,7 @@ def largest_descriptors(database: Path, count: int = 192) -> tuple[list[str], li
         "SELECT images.name, keypoints.rows, keypoints.cols, keypoints.data, descriptors.data FROM images "
         "JOIN keypoints USING (image_id) JOIN descriptors USING (image_id) ORDER BY images.name"
     )
-    connection = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)
-    try:
+    with closing(_read_only(database)) as connection:
         for name, rows, cols, keypoints, features in connection.execute(query):
             shape = np.frombuffer(keypoints or b"", np.float32).reshape(rows, cols)
             scale = (
@@ -233,8 +303,6 @@ def largest_descriptors(database: Path, count: int = 192) -> tuple[list[str], li
             chosen = np.frombuffer(features or b"", np.uint8).reshape(rows, 128)[best].astype(np.float32)
             names.append(name)
             descriptors.append(chosen / np.maximum(np.linalg.norm(chosen, axis=1, keepdims=True), 1e-6))
-    finally:
-        connection.close()
     return names, descriptors
 
 

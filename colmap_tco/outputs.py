@@ -30,7 +30,7 @@ from colmap_tco.workspace import DensePaths, read_image
 
 JPEG_QUALITY = 95
 COLOUR_DETAIL = 4
-_DIGITS = 6
+_DIGITS, _ALL_DIGITS = 6, 17
 _FEWEST_POINTS, _NEARLY_ALL = 10, 0.98
 """Points of a view below which their depths bound nothing, and the share that shall lie before the bound."""
 
@@ -280,31 +280,34 @@ def read_view(paths: DensePaths, name: str, agreed: bool = False) -> FusionMaps:
 
 
 def write_report(path: Path, report: Mapping[str, object]) -> None:
-    """Write ``report.json``: plain JSON, numbers to six significant digits, null for what is not finite."""
+    """Write ``report.json``: plain JSON, see :func:`plain`."""
     import json
 
     text = json.dumps(plain(report), indent=2, ensure_ascii=False, allow_nan=False)
     write_text(path, text + "\n")
 
 
-def plain(value: object) -> object:
-    """``value`` as JSON holds it: dataclasses, arrays, paths and numpy numbers resolved, floats rounded.
+def plain(value: object, digits: int = _DIGITS) -> object:
+    """``value`` as JSON holds it: dataclasses, arrays, paths and numpy numbers resolved, null for infinity.
+
+    Floats are rounded to ``digits`` significant ones, but for those of dataclasses, which are settings: a box
+    in map coordinates would be metres off.
 
     Raises:
         TypeError: a kind of value that has no plain form.
     """
     if is_dataclass(value) and not isinstance(value, type):
-        return plain(asdict(value))
+        return plain(asdict(value), _ALL_DIGITS)
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): plain(item, digits) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
+        return plain(value.tolist(), digits)
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, float):
-        return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
+        return float(f"{value:.{digits}g}") if math.isfinite(value) else None
     if value is None or isinstance(value, bool | int | str):
         return value
     if isinstance(value, Iterable):
-        return [plain(item) for item in value]
+        return [plain(item, digits) for item in value]
     raise TypeError(f"{type(value).__name__} has no place in a report")

@@ -72,6 +72,7 @@ def predict_chunk(
     settings: tuple[PriorConfig, TCOConfig, ConsensusConfig, int],
     report: Callable[[dict[str, float]], None],
     picture: Callable[[View], Picture] = network_image,
+    num_threads: int = -1,
 ) -> ChunkResult:
     """Optimise one chunk and give the results of the views that it owns.
 
@@ -83,6 +84,7 @@ def predict_chunk(
         settings: of priors, optimisation and consensus, and the seed.
         report: called with the terms of each step.
         picture: makes the picture of a view for the network.
+        num_threads: for the normals, one a core if not positive.
 
     Raises:
         InputError: the points do not project where the keypoints are, or an image cannot be read.
@@ -129,8 +131,8 @@ def predict_chunk(
             "correction": _correction(outcome, i, frame.scale),
         }
         corrected = corrected_view(view, frame.scale, cameras, moved, i)
-        maps = view_maps(view, prediction, i, images.valid, frame.scale, together.error)
-        before = view_maps(view, own, i, images.valid, frame.scale)
+        maps = view_maps(view, prediction, i, images.valid, frame.scale, together.error, num_threads)
+        before = view_maps(view, own, i, images.valid, frame.scale, num_threads=num_threads)
         results[view.name] = ViewResult(maps, before, figures | _asked(before, maps), corrected)
     if aligned is not None:
         steps = [
@@ -178,8 +180,9 @@ def _correction(outcome: Outcome, i: int, scale: float) -> dict[str, float]:
 
 
 def view_maps(
-    view: View, prediction: Prediction, i: int, valid: Tensor, scale: float, error: Tensor | None = None
-) -> ViewMaps:
+    view: View, prediction: Prediction, i: int, valid: Tensor, scale: float, error: Tensor | None = None,
+    num_threads: int = -1,
+) -> ViewMaps:  # fmt: skip
     """Depth in COLMAP units, normals and confidence of one view, 0 and 1 where the image is not valid.
 
     Args:
@@ -189,11 +192,12 @@ def view_maps(
         valid: (V, H, W) bool, the chunk's ``Views.valid``.
         scale: COLMAP units per unit of the chunk.
         error: (V, H, W) of an :class:`tco.consensus.Agreement`, if the prediction is of one.
+        num_threads: for the normals, one a core if not positive.
     """
     there = crop(view, valid[i]).numpy()
     depth = np.where(there, crop(view, prediction.depth[i]).numpy() * scale, 0).astype(np.float32)
     confidence = np.where(there, crop(view, prediction.confidence[i]).numpy(), 1).astype(np.float32)
-    normal = normals_from_depth(depth, view.network)
+    normal = normals_from_depth(depth, view.network, num_threads=num_threads)
     if error is None:
         return ViewMaps(depth, normal, confidence)
     spread = crop(view, error[i]).numpy()

@@ -22,7 +22,7 @@ from colmap_tco.views import (
     canvas_size,
     network_from_original,
 )
-from tco.config import knob
+from tco.config import POSITIVE, check_range, knob
 
 if TYPE_CHECKING:
     from tco.types import Cameras, Priors, SparseDepth
@@ -70,9 +70,9 @@ class PriorConfig:
 
     def __post_init__(self) -> None:
         if not 0 <= self.holdout < 1:
-            raise ValueError(f"holdout is a share of the tracks, at least 0 and below 1, not {self.holdout}")
-        if min(self.rotation_sigma, self.centre_sigma) < 0 or self.focal_sigma <= 0:
-            raise ValueError("rotation_sigma and centre_sigma must not be negative, focal_sigma be positive")
+            raise ValueError(f"holdout is a share of at least 0 and below 1, not {self.holdout}")
+        check_range(self, "rotation_sigma centre_sigma", 0)
+        check_range(self, "focal_sigma", POSITIVE)
 
 
 @dataclass(frozen=True)

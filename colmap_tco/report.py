@@ -14,6 +14,24 @@ from colmap_tco.resume import Result
 from colmap_tco.views import View
 
 
+def contents(result: Result, used: Sequence[View], left: Mapping[str, Mapping[str, str]]) -> dict[str, Any]:
+    """What the report says of images and chunks, and with which versions it was made.
+
+    Args:
+        result: with the figures of every finished view and chunk.
+        used: the views that the cloud is made of.
+        left: state (skipped, failed, unregistered) → name → why an image is in it.
+    """
+    return {
+        "views": view_table(result, used, left),
+        "images": {"used": len(used), **{state: len(reasons) for state, reasons in left.items()}},
+        "chunks": [{k: v for k, v in chunk.items() if k != "loss"} for chunk in result.chunks],
+        "held_out": held_out(result),
+        "loss": [chunk["loss"] for chunk in result.chunks],
+        "versions": versions(),
+    }
+
+
 def view_table(
     result: Result, used: Sequence[View], others: Mapping[str, Mapping[str, str]]
 ) -> dict[str, Any]:
@@ -59,3 +77,9 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             found[name] = "not installed as a package"
     return found
+
+
+def other_versions(before: Mapping[str, str]) -> str:
+    """Of what this run has other versions than that of a report; empty: of nothing."""
+    now = versions()
+    return ", ".join(f"{k} {v}, now {now[k]}" for k, v in before.items() if now.get(k, v) != v)

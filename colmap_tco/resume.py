@@ -1,10 +1,10 @@
 """The result folder while it is made: resumed after a kill, published when complete, never half there.
 
 Everything is written to ``<workspace>/.dense-tco.partial/`` with atomic files, and its
-``manifest.json`` lists the finished views under a fingerprint of the settings and inputs. A run that
-finds a partial folder with its own fingerprint goes on after the last finished view; one with another
-fingerprint is removed, for it cannot be completed any more. At the end the folder is renamed to
-``dense-tco``. Folders without our manifest are never touched.
+``manifest.json`` lists the finished views and what they were made from: settings and inputs. A run with
+the same goes on after the last finished view. Another cannot complete the folder; it removes it where no
+view is finished or the user says so. At the end the folder is renamed to ``dense-tco``. Folders without our
+manifest are never touched.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import os
 import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from colmap_tco.atomic import UNFINISHED, write_text
 from colmap_tco.errors import InputError
@@ -45,16 +45,65 @@ def fingerprint(settings: Mapping[str, object], contents: Iterable[Path], files:
     return digest.hexdigest()
 
 
+class Origin(NamedTuple):
+    """What a result is made from.
+
+    Attributes:
+        settings: name → value as JSON holds it, exactly, of those that decide the result.
+        inputs: name of each file that decides it → hash of its bytes.
+        later: names of the settings that decide only what follows the depth maps.
+    """
+
+    settings: Mapping[str, object]
+    inputs: Mapping[str, str]
+    later: frozenset[str] = frozenset()
+
+    def same_result(self, other: Origin) -> bool:
+        """Whether both give the same result."""
+        return self.settings == other.settings and self.inputs == other.inputs
+
+    def same_maps(self, other: Origin) -> bool:
+        """Whether both give the same depth maps."""
+        theirs, own = ({k: v for k, v in o.settings.items() if k not in self.later} for o in (other, self))
+        return theirs == own and self.inputs == other.inputs
+
+    def difference(self, before: Origin) -> str:
+        """How a result came about that was made from ``before``, to follow upon "was made"."""
+        settings, inputs = (_changed(*both) for both in zip(before[:2], self[:2], strict=True))
+        if not before.settings:
+            return "by an earlier version"
+        values = [f"{k} {_shown(before.settings, k)}, now {_shown(self.settings, k)}" for k in settings]
+        told = [f"with other settings ({'; '.join(values)})"] if values else []
+        more = f" and {len(inputs) - _NAMED} more" if len(inputs) > _NAMED else ""
+        told += [f"from other inputs ({', '.join(inputs[:_NAMED])}{more})"] if inputs else []
+        return " and ".join(told)
+
+
+_NAMED = 5
+"""Files that a message names before it says how many more there are."""
+
+
+def _changed(before: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
+    """Names of what is another, new or missing."""
+    return [name for name in {**before, **now} if _shown(before, name) != _shown(now, name)]
+
+
+def _shown(values: Mapping[str, object], name: str) -> str:
+    return json.dumps(values[name]) if name in values else "unknown"
+
+
 class _Record(NamedTuple):
     """What a manifest holds of the work that was done: figures of views by name, and of chunks.
 
     Attributes:
         chunk_size: views of the largest chunk that was planned with; 0: nothing was planned.
+        mapping: seconds that it took to make the model of these images, where a run of ours did.
     """
 
     views: dict[str, dict[str, object]]
-    chunks: list[dict[str, object]]
+    chunks: list[dict[str, Any]]
     chunk_size: int = 0
+    mapping: float = 0.0
 
 
 class Result:
@@ -62,17 +111,16 @@ class Result:
 
     Attributes:
         paths: where to write, or, if ``finished``, where the result is.
-        finished: True if the published result has this fingerprint: nothing is left to do.
+        finished: True if the published result is made from the same: nothing is left to do.
         views: what was recorded of each finished view, by name.
         chunks: what was recorded of each finished chunk, earlier runs included.
     """
 
-    def __init__(self, root: Path, keys: tuple[str, str], finished: bool, record: _Record) -> None:
+    def __init__(self, root: Path, origin: Origin, finished: bool, record: _Record) -> None:
         self.paths: DensePaths = dense_paths(root) if finished else partial_paths(root)
         self.finished = finished
-        self.views, self.chunks, self._chunk_size = record
-        self._root = root
-        self._fingerprint, self._maps = keys
+        self.views, self.chunks, self._chunk_size, self._mapping = record
+        self._root, self._origin = root, origin
 
     def is_done(self, name: str) -> bool:
         """Whether this view was finished, now or by an earlier run."""
@@ -87,12 +135,22 @@ class Result:
         self._chunk_size = self._chunk_size or limit
         return self._chunk_size
 
+    def seconds(self, spent: Mapping[str, float]) -> dict[str, float]:
+        """Seconds of each stage: what this run spent, and earlier ones on the model and the chunks."""
+        chunks = sum(chunk.get("seconds", 0.0) for chunk in self.chunks)
+        return ({"mapping": self._mapping} if self._mapping else {}) | {**spent, "optimisation": chunks}
+
     def mark_done(self, views: Mapping[str, Mapping[str, object]]) -> None:
         """Record that all files of some views, by name, are written, with the figures of each for the report.
 
         The manifest is written as a whole, so that many views are better told of at once.
         """
         self.views.update({name: dict(figures) for name, figures in views.items()})
+        self._save(complete=False)
+
+    def mark_mapping(self, seconds: float) -> None:
+        """Record how long it took to make the model."""
+        self._mapping = seconds
         self._save(complete=False)
 
     def mark_chunk(self, figures: Mapping[str, object]) -> None:
@@ -121,9 +179,10 @@ class Result:
         manifest = {
             "made_by": _MADE_BY,
             "format": _FORMAT,
-            "fingerprint": self._fingerprint,
-            "maps": self._maps,
+            "settings": self._origin.settings,
+            "inputs": self._origin.inputs,
             "complete": complete,
+            "mapping": self._mapping,
             "chunk_size": self._chunk_size,
             "chunks": self.chunks,
             "views": self.views,
@@ -131,82 +190,65 @@ class Result:
         write_text(self.paths.manifest, json.dumps(manifest, indent=1, allow_nan=False) + "\n")
 
 
-def open_result(
-    root: Path, fingerprint: str, overwrite: bool = False, maps: str = "", settings: object = None
-) -> Result:
+def open_result(root: Path, origin: Origin, overwrite: bool = False) -> Result:
     """Find out what there is to do, and prepare the partial folder for it.
 
     Args:
         root: the workspace.
-        fingerprint: of this run's settings and inputs, see :func:`fingerprint`.
+        origin: what this run makes its result from.
         overwrite: make the result anew even if there is one, and let it replace the one there. The maps of
             a result that differs by what comes after them alone are kept.
-        maps: fingerprint of what decides the depth maps; empty: the same as ``fingerprint``.
-        settings: of this run, as ``report.json`` holds them, so that an error can say what is different.
 
     Raises:
-        InputError: a result of other settings is there and ``overwrite`` is not given; or a folder of
-            that name is there which we did not make.
+        InputError: a result or unfinished views of another origin are there and ``overwrite`` is not given;
+            or a folder of that name is there which we did not make.
     """
     final, partial, aside = dense_paths(root), partial_paths(root), _aside(root)
-    keys = (fingerprint, maps or fingerprint)
     reusable = False
     if aside.root.exists():
         _restore(final, aside)
     if final.root.exists():
         _require_ours(final)
-        same = _read(final).get("fingerprint") == fingerprint
-        reusable = not same and _maps_key(final) == keys[1]
+        before = _origin(final)
+        same = origin.same_result(before)
+        reusable = not same and origin.same_maps(before)
         if same and not overwrite:
             log.info("%s is complete and made with these settings: nothing to do", final.root)
-            return Result(root, keys, True, _record(final))
+            return Result(root, origin, True, _record(final))
         if not overwrite:
             hint = "replace it (its depth maps will be kept)" if reusable else "replace it"
             raise InputError(
-                f"{final.root} was made {_difference(final, settings)}; give --overwrite to {hint}, or "
+                f"{final.root} was made {origin.difference(before)}; give --overwrite to {hint}, or "
                 "rename it to keep it"
             )
-    record = _resume(partial, keys[1])
+    record = _resume(partial, origin, overwrite)
     if reusable and not record.views:
         record = _reuse(final, partial)
-    result = Result(root, keys, False, record)
+    result = Result(root, origin, False, record)
     result._save(complete=False)
     return result
 
 
-def _difference(paths: DensePaths, settings: object) -> str:
-    """How the result that is there came about otherwise than by these settings."""
-    try:
-        before = _flat(json.loads(paths.report.read_text("utf-8"))["settings"])
-    except (OSError, ValueError, KeyError):
-        before = {}
-    now = _flat(settings)
-    other = [name for name in now if name in before and before[name] != now[name] and name not in _FREE]
-    if not other:
-        return "from other inputs, with other settings or by another version"
-    told = [f"{name} {json.dumps(before[name])}, now {json.dumps(now[name])}" for name in other]
-    return f"with other settings ({'; '.join(told)})"
+def _resume(partial: DensePaths, origin: Origin, overwrite: bool) -> _Record:
+    """The finished views in a partial folder, if their maps have the same origin; else the folder is removed.
 
-
-_FREE = ("given", "overwrite", "report_page", "num_threads")
-"""Settings that do not change the result."""
-
-
-def _flat(settings: object) -> dict[str, object]:
-    """Settings by name, those of nested groups among them; their names are all different."""
-    found: dict[str, object] = {}
-    for name, value in settings.items() if isinstance(settings, dict) else ():
-        found |= _flat(value) if isinstance(value, dict) else {name: value}
-    return found
-
-
-def _resume(partial: DensePaths, maps: str) -> _Record:
-    """The finished views in a partial folder with this fingerprint of maps; any other of ours is removed."""
+    Raises:
+        InputError: views would be lost, and ``overwrite`` is not given.
+    """
     if not partial.root.exists():
         return _Record({}, [])
     _require_ours(partial)
-    if _maps_key(partial) != maps:
-        log.info("%s was begun from other inputs or with other settings: beginning anew", partial.root)
+    record = _record(partial)
+    views = {name: figures for name, figures in record.views.items() if _all_there(partial, name)}
+    before = _origin(partial)
+    if not origin.same_maps(before):
+        begun = f"{partial.root} was begun {origin.difference(before)}"
+        if views and not overwrite:
+            raise InputError(
+                f"{begun}: what it was begun with goes on after its {len(views)} finished views, --overwrite "
+                "begins anew without them"
+            )
+        log.info("%s: beginning anew", begun)
         shutil.rmtree(partial.root)
         return _Record({}, [])
     for unfinished in list(partial.root.rglob(f"*{UNFINISHED}*")):
@@ -214,8 +256,6 @@ def _resume(partial: DensePaths, maps: str) -> _Record:
             shutil.rmtree(unfinished)
         else:
             unfinished.unlink()
-    record = _record(partial)
-    views = {name: figures for name, figures in record.views.items() if _all_there(partial, name)}
     log.info("%s: going on after %d finished views", partial.root, len(views))
     return record._replace(views=views)
 
@@ -282,17 +322,20 @@ def _read(paths: DensePaths) -> dict[str, object]:
     return manifest if isinstance(manifest, dict) and manifest.get("format") == _FORMAT else {}
 
 
-def _maps_key(paths: DensePaths) -> object:
-    """The fingerprint of the maps; manifests of the first versions have one fingerprint for everything."""
+def _origin(paths: DensePaths) -> Origin:
+    """What the manifest says that a result was made from; nothing in those of the first versions."""
     manifest = _read(paths)
-    return manifest.get("maps", manifest.get("fingerprint"))
+    settings, inputs = manifest.get("settings"), manifest.get("inputs")
+    return Origin(settings if isinstance(settings, dict) else {}, inputs if isinstance(inputs, dict) else {})
 
 
 def _record(paths: DensePaths) -> _Record:
     manifest = _read(paths)
     views, chunks, size = manifest.get("views"), manifest.get("chunks"), manifest.get("chunk_size")
+    mapping = manifest.get("mapping")
     return _Record(
         dict(views) if isinstance(views, dict) else {},
         list(chunks) if isinstance(chunks, list) else [],
         size if isinstance(size, int) else 0,
+        mapping if isinstance(mapping, float) else 0.0,
     )

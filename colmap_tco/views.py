@@ -26,7 +26,7 @@ from colmap_tco._pycolmap import Camera, Floats, Mask, Registered
 from colmap_tco.errors import InputError
 from colmap_tco.pinhole import CELL, Pinhole, trusted_cells, undistorted_camera
 from colmap_tco.workspace import Workspace, listing, read_image
-from tco.config import knob
+from tco.config import check_range, knob
 
 if TYPE_CHECKING:
     from tco.types import Cameras, Views
@@ -51,6 +51,9 @@ class ViewConfig:
         "",
         "folder of masks for the original images, <image name>.png, 0 is excluded; empty: none",
     )
+
+    def __post_init__(self) -> None:
+        check_range(self, "max_image_size", 0)
 
 
 @dataclass(frozen=True)

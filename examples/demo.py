@@ -1,12 +1,15 @@
 """Render a room, reconstruct it with COLMAP, densify it, and compare the result with the rendered truth.
 
-Run by ``make demo``. Everything is made in the folder ``demo/``; nothing is downloaded.
+Run by ``make demo``. Everything is made in the folder ``demo/``; nothing is downloaded. A second run keeps
+the pictures and COLMAP's model, and makes the rest anew.
 """
 
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -21,12 +24,41 @@ from training.scenes import Sample, walk
 
 
 def write_images(sample: Sample, folder: Path) -> list[str]:
-    """Save the views as JPEG files and return their names."""
+    """Save the views as JPEG files, but for those that are there already, and return their names."""
     folder.mkdir(parents=True, exist_ok=True)
-    names = [f"view_{i:02d}.jpg" for i in range(len(sample.images))]
-    for name, image in zip(names, sample.images, strict=True):
-        cv2.imwrite(str(folder / name), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
-    return names
+    files = pictures(sample)
+    for name, content in files.items():
+        if not holds(folder / name, content):
+            (folder / name).write_bytes(content)
+    return list(files)
+
+
+def pictures(sample: Sample) -> dict[str, bytes]:
+    """Name → JPEG file of each view."""
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 95]
+    encoded = [cv2.imencode(".jpg", image[..., ::-1], quality)[1] for image in sample.images]
+    return {f"view_{i:02d}.jpg": content.tobytes() for i, content in enumerate(encoded)}
+
+
+def holds(file: Path, content: bytes) -> bool:
+    """Whether a file is there and holds these bytes."""
+    return file.is_file() and file.read_bytes() == content
+
+
+def drop_other_scene(sample: Sample, root: Path) -> None:
+    """Remove the pictures and the model of another scene, which an earlier demo made here.
+
+    Raises:
+        SystemExit: pictures are there that no demo made.
+    """
+    ours, there = pictures(sample), sorted((root / "images").glob("*"))
+    if all(holds(path, ours.get(path.name, b"")) for path in there):
+        return
+    if not all(path.match("view_??.jpg") for path in there):
+        sys.exit(f"{root / 'images'} holds pictures that are not the demo's; name another --folder")
+    shutil.rmtree(root / "images")
+    shutil.rmtree(root / "sparse", ignore_errors=True)
+    (root / "database.db").unlink(missing_ok=True)
 
 
 def accuracy(sample: Sample, names: list[str], dense: Path) -> dict[str, float]:
@@ -61,15 +93,16 @@ def spread(poses: list[NDArray[np.floating]]) -> float:
     return float(np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()))
 
 
-def main() -> int:
-    """Command line of the demo; exit code of densify."""
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line of the demo, where other flags are those of densify, whose exit code this is."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--folder", type=Path, default=Path("demo"))
     parser.add_argument("--views", type=int, default=10)
-    args, rest = parser.parse_known_args()
+    args, rest = parser.parse_known_args(argv)
     sample = walk(seed=4, views=args.views, shape=(480, 640))
+    drop_other_scene(sample, args.folder)
     names = write_images(sample, args.folder / "images")
-    code = colmap_tco(["densify", str(args.folder), *rest])
+    code = colmap_tco(["densify", str(args.folder), "--overwrite", *rest])
     dense = args.folder / "dense-tco"
     if code not in (0, PartlyDoneError.exit_code):  # what is there, if anything, is of an earlier run
         return code

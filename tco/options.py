@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from tco.config import knob
+from tco.config import POSITIVE, check_range, knob
 
 EVERY = 1_000_000
 """More than any chunk has views: every target, every source."""
@@ -60,6 +60,9 @@ class AblationConfig:
         "1, 2 and 0.01) instead of by their uncertainty",
     )
 
+    def __post_init__(self) -> None:
+        check_range(self, "radius_factor free_rate", POSITIVE)
+
 
 @dataclass(frozen=True)
 class PolishConfig:
@@ -104,6 +107,8 @@ class PolishConfig:
             raise ValueError("polish_looks must not be negative, and there must be a source and a level")
         if self.polish_smoothness < 0 or self.polish_consistency < 0:
             raise ValueError("polish_smoothness and polish_consistency are weights, not negative")
+        check_range(self, "polish_rate polish_uncertainty", 0)
+        check_range(self, "polish_levels", 1)
 
     def steps(self, views: int) -> int:
         """Steps that refine each of so many views as often as wanted."""
@@ -235,6 +240,12 @@ class TCOConfig:
             raise ValueError("steps must not be negative, targets, sources and refresh at least 1")
         if not 0 <= self.point_dropout < 1:
             raise ValueError(f"point_dropout is a share below 1, not {self.point_dropout}")
+        check_range(self, "lora_rank", 1)
+        check_range(self, "lora_alpha clip consistency_tolerance", POSITIVE)
+        check_range(self, "structure consistency_start", 0, 1)
+        check_range(self, "photometric_weight geometric_weight depth_weight sparse_weight", 0)
+        check_range(self, "consistency_weight camera_weight rate camera_rate", 0)
+        check_range(self, "reencode stop_after occlusion_tolerance", 0)
 
     def reference_schedule(self) -> TCOConfig:
         """The same objective on the published schedule.

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -35,7 +36,17 @@ DISTORTIONS = {
     "FOV": [0.8],
     "THIN_PRISM_FISHEYE": [0.01, -0.01, 0.001, 0.001, 0.0, 0.0, 0.001, 0.001],
 }
-"""Every distorting camera model that all supported versions of pycolmap know, with telling parameters."""
+"""Every camera model that a pinhole can stand for, with telling parameters; those that the version knows."""
+
+NEWER = {
+    "RAD_TAN_THIN_PRISM_FISHEYE": [0.01, -0.01, 0, 0, 0, 0, 0.001, 0.001, 0.001, 0.001, -0.001, 0.001],
+    "SIMPLE_DIVISION": [-0.1],
+    "DIVISION": [0.08],
+    "SIMPLE_FISHEYE": [],
+    "FISHEYE": [],
+    "EUCM": [0.4, 1.1],
+}
+DISTORTIONS |= {k: v for k, v in NEWER.items() if hasattr(_pycolmap.load().CameraModelId, k)}
 
 
 @dataclass(frozen=True)
@@ -276,6 +287,20 @@ def fresh_room(room: Room, tmp_path: Path) -> Room:
     root = tmp_path / "room"
     shutil.copytree(room.root, root, ignore=shutil.ignore_patterns("dense-tco", ".dense-tco*"))
     return Room(root, room.names, room.sample)
+
+
+@pytest.fixture
+def same_logging() -> Iterator[None]:
+    """Undo the logging that the command line sets up, for tests that call it inside this process."""
+    root = logging.getLogger()
+    handlers, level = list(root.handlers), root.level
+    levels = {name: logging.getLogger(name).level for name in ("colmap_tco", "tco", "pycolmap")}
+    yield
+    logging.captureWarnings(False)
+    root.handlers[:] = handlers
+    root.setLevel(level)
+    for name, before in levels.items():
+        logging.getLogger(name).setLevel(before)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -23,12 +23,13 @@ from colmap_tco.ply import read_ply
 from colmap_tco.scene import Scene, open_scene
 from colmap_tco.views import ViewConfig
 from colmap_tco.workspace import dense_paths
-from examples import custom_backbone, custom_prior, python_api, rgbd_prior
+from examples import custom_backbone, custom_prior, demo, python_api, rgbd_prior
 from tco.backbones.base import Backbone
 from tco.geometry import transform, unproject
 from tco.options import PolishConfig, TCOConfig
 from tco.types import Prediction, SparseDepth
 from tests.conftest import Room
+from training.scenes import walk
 
 ROOT = Path(__file__).resolve().parents[1]
 SIZE, STEPS = 128, 2
@@ -268,3 +269,26 @@ def test_command_lines_say_what_the_examples_found(
     told = printed(rgbd_prior, [root, str(tmp_path), "--unit", str(UNIT)], monkeypatch, capsys)
     metres = re.search(r"one COLMAP unit is (\S+) m", told)
     assert metres is not None and float(metres[1]) == pytest.approx(METRES, rel=0.005)
+
+
+def test_the_demo_runs_twice_in_one_folder(
+    tmp_path: Path, same_logging: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Pictures and model are kept, the rest is made anew; pictures of another scene are not mixed in."""
+    words = ["--folder", str(tmp_path), "--views", "4", "--max_image_size", "96", "--steps", "0"]
+    assert demo.main(words) == 0
+    files = [*tmp_path.glob("images/*"), *tmp_path.glob("sparse/*/*")]
+    kept = {path: path.stat().st_mtime_ns for path in files}
+    first = dense_paths(tmp_path).manifest.stat().st_mtime_ns
+    assert demo.main(words) == 0
+    assert {path: path.stat().st_mtime_ns for path in files} == kept
+    assert dense_paths(tmp_path).manifest.stat().st_mtime_ns > first
+    assert capsys.readouterr().out.count("against the rendered truth") == 2
+    other = walk(seed=5, views=3, shape=(48, 64))
+    demo.drop_other_scene(other, tmp_path)
+    assert not (tmp_path / "images").exists() and not (tmp_path / "sparse").exists()
+    demo.write_images(other, tmp_path / "images")
+    (tmp_path / "images" / "holiday.jpg").write_bytes(b"mine")
+    with pytest.raises(SystemExit, match="not the demo's"):
+        demo.drop_other_scene(walk(seed=5, views=2, shape=(48, 64)), tmp_path)
+    assert (tmp_path / "images" / "holiday.jpg").read_bytes() == b"mine"

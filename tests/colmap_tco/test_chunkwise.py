@@ -10,8 +10,10 @@ import pytest
 from colmap_tco.chunks import Chunk
 from colmap_tco.chunkwise import Pace, progress_told
 from colmap_tco.progress import Progress
-from colmap_tco.resume import open_result
+from colmap_tco.resume import Origin, open_result
 from tco.options import PolishConfig, TCOConfig
+
+KEY = Origin({"seed": 0}, {})
 
 
 @pytest.mark.parametrize(("steps", "polish"), [(5, 8), (3, 0), (1, 1)])
@@ -33,7 +35,7 @@ def test_the_steps_of_a_chunk_lead_to_its_views(steps: int, polish: int) -> None
 
 
 def test_an_interruption_says_what_is_finished(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    result = open_result(tmp_path, "key")
+    result = open_result(tmp_path, KEY)
     result.mark_done({"a": {}, "b": {}})
     with caplog.at_level(logging.WARNING), pytest.raises(KeyboardInterrupt), progress_told(result, 7):
         raise KeyboardInterrupt
@@ -42,8 +44,8 @@ def test_an_interruption_says_what_is_finished(tmp_path: Path, caplog: pytest.Lo
 
 def test_a_run_goes_on_with_the_chunks_that_were_planned(tmp_path: Path) -> None:
     """The memory that is free now does not decide what an earlier run has begun; another key forgets it."""
-    result = open_result(tmp_path, "key")
+    result = open_result(tmp_path, KEY)
     assert result.chunk_size(40) == 40
     result.mark_done({"a": {}})
-    assert open_result(tmp_path, "key").chunk_size(25) == 40
-    assert open_result(tmp_path, "other").chunk_size(25) == 25
+    assert open_result(tmp_path, KEY).chunk_size(25) == 40
+    assert open_result(tmp_path, Origin({"seed": 1}, {})).chunk_size(25) == 25

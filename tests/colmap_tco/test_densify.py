@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,22 +17,28 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from colmap_tco import _pycolmap
-from colmap_tco.backbones import NetworkConfig
+from colmap_tco import _pycolmap, chunkwise
+from colmap_tco.backbones import NetworkConfig, select
 from colmap_tco.chunks import plan_chunks
 from colmap_tco.cli import main
-from colmap_tco.densify import Densified, DensifyConfig, densify
+from colmap_tco.densify import Densified, DensifyConfig, densify, limited_threads
 from colmap_tco.errors import InputError, PartlyDoneError
+from colmap_tco.fusion import FusionConfig
 from colmap_tco.lock import locked
+from colmap_tco.mapping import MappingConfig
 from colmap_tco.maps import read_map
-from colmap_tco.outputs import reaches, read_view
+from colmap_tco.origin import origin_of
+from colmap_tco.outputs import plain, reaches, read_view
 from colmap_tco.ply import read_ply, read_vis
+from colmap_tco.predict import view_maps
 from colmap_tco.priors import PriorConfig, held_out
 from colmap_tco.progress import Progress
+from colmap_tco.scene import open_scene
 from colmap_tco.tracks import covisibility, read_tracks
 from colmap_tco.views import ViewConfig, make_views
-from colmap_tco.workspace import DensePaths, open_workspace
+from colmap_tco.workspace import DensePaths, WorkspaceConfig, open_workspace
 from tco.options import ConsensusConfig, PolishConfig, TCOConfig
+from tco.types import Prediction
 
 if TYPE_CHECKING:
     from tests.conftest import Room
@@ -209,6 +214,30 @@ def test_the_report_says_what_was_done(done: Done) -> None:
     assert report["workspace"]["model"].endswith("sparse/0")
 
 
+def test_a_number_of_threads_binds_all_who_have_their_own(room: Room) -> None:
+    """Torch and OpenCV while the run lasts, and the loops over pixels: with one, no thread is begun."""
+    import threading
+
+    import cv2
+    import torch
+
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    with limited_threads(1):
+        assert (torch.get_num_threads(), cv2.getNumThreads()) == (1, 1)
+    assert (torch.get_num_threads(), cv2.getNumThreads()) == before
+
+    scene = open_scene(room.root, ViewConfig(max_image_size=160))
+    view, valid = scene.images[0], scene.views.valid
+    assert view.network.height > 64  # more rows than a thread takes at a time
+    flat = Prediction(torch.ones(valid.shape), torch.ones(valid.shape), scene.priors.cameras, (0,))
+    begun: list[str] = []
+    for threads in (1, 2):
+        threading.setprofile(lambda *_: begun.append(threading.current_thread().name))
+        view_maps(view, flat, 0, valid, 1.0, num_threads=threads)
+        threading.setprofile(None)
+        assert bool(begun) == (threads == 2)
+
+
 def test_the_summary_names_the_cloud_and_the_quality(done: Done) -> None:
     text = done.result.summary()
     assert str(done.dense / "fused.ply") in text and str(done.dense / "report.json") in text
@@ -224,6 +253,53 @@ def test_a_second_run_says_that_all_is_done_and_changes_nothing(done: Done) -> N
     threads = replace(threads, fusion=replace(threads.fusion, num_threads=1))  # decides nothing
     assert not made(done.room.root, threads).fresh
     assert bytes_of(done.room.root, besides=()) == before
+
+
+def test_a_copy_of_a_workspace_is_complete_too(done: Done, tmp_path: Path) -> None:
+    """With files of another time, and where a model is there, however one would have been made."""
+    import shutil
+
+    root = tmp_path / "elsewhere"
+    shutil.copytree(done.room.root, root, copy_function=shutil.copyfile)
+    assert not made(root, config(steps=2)).fresh
+    settings = config(
+        steps=2,
+        mapping=MappingConfig(mapper="global", matcher="sequential"),
+        workspace=WorkspaceConfig(image_path=str(root / "images"), model_path=str(root / "sparse" / "0")),
+    )
+    assert not made(root, settings).fresh
+    picture = root / "images" / done.room.names[1]
+    picture.write_bytes((root / "images" / done.room.names[2]).read_bytes())
+    with pytest.raises(InputError, match=f"other inputs .picture {done.room.names[1]}.; give --overwrite"):
+        made(root, config(steps=2))
+
+
+def test_the_device_counts_and_not_how_it_was_named(done: Done) -> None:
+    import torch
+
+    if torch.cuda.is_available():
+        pytest.skip("auto is another device here")
+    settings = config(steps=2)
+    auto = replace(settings, network=replace(settings.network, device="auto", backbone="sweep"))
+    assert not made(done.room.root, auto).fresh
+
+
+def test_boxes_in_map_coordinates_are_told_apart(done: Done) -> None:
+    """Two that differ by 3 m at 5400 km, and the report has them to the last digit."""
+    box = (499_000.0, 5_399_000.0, 0.0, 501_000.0, 5_401_001.25, 900.0)
+    far = (*box[:4], box[4] + 3, box[5])
+    origins = [
+        origin_of(
+            open_workspace(done.room.root),
+            (),
+            config(fusion=FusionConfig(roi=roi)),
+            select(NetworkConfig(device="cpu")),
+        )
+        for roi in (box, far)
+    ]
+    assert not origins[0].same_result(origins[1]) and origins[0].same_maps(origins[1])
+    assert origins[1].settings["roi"] == list(far)
+    assert plain({"settings": FusionConfig(roi=far)})["settings"]["roi"] == list(far)  # type: ignore[index]
 
 
 @pytest.mark.parametrize("changes", [{"seed": 1}, {"priors": PriorConfig(holdout=0.2)}])
@@ -416,6 +492,10 @@ def test_other_settings_of_the_fusion_keep_the_depth_maps(fresh_room: Room) -> N
         assert (now.st_ino, now.st_mtime_ns) == (status.st_ino, status.st_mtime_ns)
     assert second.report["points"] > first.report["points"]
     assert second.report["loss"] == first.report["loss"]
+    spent = [run.report["seconds"]["optimisation"] for run in (first, second)]
+    assert (
+        spent[0] == spent[1] == pytest.approx(first.report["chunks"][0]["seconds"], rel=1e-5) and spent[0] > 0
+    )
     assert len(first.report["loss"][0]) == settings.tco.all_steps(len(fresh_room.names))
     assert second.report["views"] == first.report["views"]
     assert not made(fresh_room.root, loose).fresh
@@ -634,17 +714,9 @@ def test_a_folder_of_bare_images_is_mapped_first(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def command() -> Iterator[Callable[..., int]]:
-    """The command line inside this process; the logging that it sets up is undone."""
-    root = logging.getLogger()
-    handlers, level = list(root.handlers), root.level
-    levels = {name: logging.getLogger(name).level for name in ("colmap_tco", "tco")}
-    yield lambda *words: main([*words])
-    logging.captureWarnings(False)
-    root.handlers[:] = handlers
-    root.setLevel(level)
-    for name, before in levels.items():
-        logging.getLogger(name).setLevel(before)
+def command(same_logging: None) -> Callable[..., int]:
+    """The command line inside this process."""
+    return lambda *words: main([*words])
 
 
 def test_exit_code_0_and_the_summary(
@@ -658,6 +730,35 @@ def test_exit_code_0_and_the_summary(
     assert "already made" in told.out and "nothing to do" in told.err
 
 
+@pytest.mark.parametrize(
+    ("flag", "value"),
+    [
+        ("--lora_rank", "0"), ("--lora_alpha", "0"), ("--rate", "-1"), ("--camera_rate", "-0.1"),
+        ("--holdout", "2"), ("--holdout", "1"), ("--holdout", "-0.1"), ("--polish_levels", "0"),
+        ("--polish_levels", "2,-1"), ("--polish_rate", "-1"), ("--structure", "7"), ("--structure", "-0.1"),
+        ("--clip", "-1"), ("--chunk_size", "-3"), ("--max_image_size", "-5"), ("--camera_weight", "-1"),
+        ("--consistency_start", "1.5"), ("--consistency_tolerance", "0"), ("--stop_after", "-1"),
+        ("--radius_factor", "0"), ("--seed", "-1"), ("--overlap", "-1"), ("--num_similar", "0"),
+        ("--kept_confidence", "0.5"), ("--reencode", "-1"),
+    ],
+)  # fmt: skip
+def test_exit_code_2_for_values_that_make_no_sense(
+    command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str], flag: str, value: str
+) -> None:
+    """Found out before the workspace is looked at, which is not there."""
+    assert command("densify", str(tmp_path / "nowhere"), f"{flag}={value}") == 2
+    assert flag.removeprefix("--") in capsys.readouterr().err
+
+
+def test_exit_code_2_for_layers_that_the_network_does_not_have(
+    command: Callable[..., int], fresh_room: Room, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("densify", str(fresh_room.root), *FLAGS, "--lora_targets", "conv,nonsense")
+    assert command(*words, "--steps", "1") == 2
+    assert "--lora_targets, --unfrozen: the target 'nonsense' fits no" in capsys.readouterr().err
+    assert not finished(fresh_room.root)
+
+
 def test_exit_code_3_without_images_or_folder(
     command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -666,6 +767,20 @@ def test_exit_code_3_without_images_or_folder(
     assert command("densify", str(tmp_path)) == 3
     assert "no pictures" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_exit_code_4_where_not_even_two_views_fit(
+    command: Callable[..., int], fresh_room: Room, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Every chunk asks for more memory than any machine has; nothing is published."""
+    import torch
+
+    monkeypatch.setattr(chunkwise, "predict_chunk", lambda *_: torch.empty(1 << 60, dtype=torch.uint8))
+    assert command("densify", str(fresh_room.root), *FLAGS, "--steps", "0") == 4
+    told = capsys.readouterr().err
+    assert "on with 3" in told and "not even two views fit the memory" in told and "--max_image_size" in told
+    assert not (fresh_room.root / "dense-tco").exists()
 
 
 @pytest.mark.parametrize(
@@ -698,11 +813,9 @@ def test_an_existing_result_is_kept_and_completed_within_a_region(fresh_room: Ro
     """COLMAP's undistorted cameras with true depths in the upper half; the cloud cut and thinned."""
     from colmap_tco import _pycolmap
     from colmap_tco.fill import FillConfig
-    from colmap_tco.fusion import FusionConfig
     from colmap_tco.maps import write_map
     from colmap_tco.normals import normals_from_depth
     from colmap_tco.pinhole import Pinhole
-    from colmap_tco.workspace import DensePaths
 
     root, dense = fresh_room.root, DensePaths(fresh_room.root / "dense")
     dense.root.mkdir()

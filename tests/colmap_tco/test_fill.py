@@ -205,8 +205,6 @@ def test_folders_without_a_result_are_named(made: Made, tmp_path: Path) -> None:
         copy.depth_map(name).unlink(missing_ok=True)
     with pytest.raises(InputError, match=r"no geometric depth map of these views.*geom_consistency"):
         open_existing(FillConfig(fill_only=str(copy.root)), made.views)
-    with pytest.raises(InputError, match="at least 1"):
-        open_existing(FillConfig(fill_only=str(copy.root), kept_confidence=0.5), made.views)
 
 
 def test_distorted_cameras_are_refused(made: Made, tmp_path: Path) -> None:

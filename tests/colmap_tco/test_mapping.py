@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import logging
+import re
+import shutil
 import sqlite3
+import time
+from contextlib import closing
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from colmap_tco import _pycolmap
+from colmap_tco import _pycolmap, mapping
+from colmap_tco.cli import configure_logging
 from colmap_tco.errors import InputError
 from colmap_tco.mapping import (
     MappingConfig,
@@ -18,6 +24,7 @@ from colmap_tco.mapping import (
     largest_descriptors,
     similarity,
 )
+from colmap_tco.progress import Progress
 from colmap_tco.workspace import find_models, open_workspace
 
 SIZE = (288, 216)
@@ -88,6 +95,100 @@ def test_bare_pictures_become_a_workspace(mapped: Path) -> None:
     centres = np.stack([-e.cam_from_world[:, :3].T @ e.cam_from_world[:, 3] for e in workspace.images])
     steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     assert steps / steps.mean() == pytest.approx(np.ones(4), abs=0.1)
+
+
+def compared(root: Path) -> set[tuple[int, int]]:
+    """Pairs of pictures, as they are numbered in their names, that were matched."""
+    with closing(sqlite3.connect(root / "database.db")) as database:
+        names = dict(database.execute("SELECT image_id, name FROM images"))
+        pairs = database.execute("SELECT pair_id FROM two_view_geometries").fetchall()
+    # COLMAP's key of a pair: the smaller id times the largest possible, plus the other.
+    ids = [(pair // 2147483647, pair % 2147483647) for (pair,) in pairs]
+    found = [sorted(int(Path(names[i]).stem) for i in pair) for pair in ids]
+    return {(a, b) for a, b in found}
+
+
+def test_pictures_beside_the_model_to_be_and_neighbours_in_name_order(pictures: Path, tmp_path: Path) -> None:
+    """Bare pictures in the workspace itself; each is compared with the next alone, as in a video."""
+    for picture in pictures.iterdir():
+        shutil.copy(picture, tmp_path / picture.name)
+    ensure_model(tmp_path, config=MappingConfig(matcher="sequential", overlap=1), num_threads=1)
+    assert compared(tmp_path) == {(i, i + 1) for i in range(4)}
+    workspace = open_workspace(tmp_path)
+    assert workspace.image_folder == tmp_path
+    assert len(workspace.images) >= 4
+
+
+@pytest.mark.parametrize(("cameras", "expected"), [("shared", 2), ("per_image", 5)])
+def test_pictures_of_one_size_share_a_camera_or_not(
+    pictures: Path, tmp_path: Path, cameras: str, expected: int
+) -> None:
+    """Two of the five are smaller, as from another camera."""
+    (tmp_path / "images").mkdir()
+    for i in range(5):
+        picture = cv2.imread(str(pictures / f"{i}.png"))
+        if i in (1, 3):
+            picture = cv2.resize(picture, (240, 180), interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), picture)
+    ensure_model(tmp_path, config=MappingConfig(cameras=cameras), num_threads=1)
+    workspace = open_workspace(tmp_path)
+    assert len(workspace.images) == 5 and not workspace.skipped  # each of the size of its camera
+    assert len({entry.camera.camera_id for entry in workspace.images}) == expected
+    for entry in workspace.images:
+        small = entry.name in ("1.png", "3.png")
+        assert _pycolmap.camera_size(entry.camera) == ((240, 180) if small else SIZE)
+
+
+def test_every_phase_says_what_it_found_and_moves_the_bar(
+    pictures: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "images").symlink_to(pictures)
+    progress = Progress(interval=0.0)
+    with caplog.at_level(logging.INFO, "colmap_tco"):
+        ensure_model(tmp_path, num_threads=1, progress=progress)
+    told = [record.__dict__["data"] for record in caplog.records if "data" in record.__dict__]
+    furthest = {entry["stage"]: (entry["done"], entry["total"]) for entry in told}
+    assert list(furthest) == ["features", "matching", "mapping"]
+    assert list(furthest.values()) == [(5, 5), (10, 10), (5, 5)]
+    assert re.search(r"\d{4} features in 5 images", caplog.text)
+    assert "10 of 10 pairs of images match" in caplog.text
+
+
+def test_the_bar_follows_a_database_that_is_being_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a lock on it: whoever writes may take it as a whole at any time."""
+    monkeypatch.setattr(mapping, "LOOK_AGAIN", 0.002)
+    job = mapping._Job(tmp_path, [], tmp_path, 1, 0)
+    progress = Progress()
+    progress.stage("features", 40)
+    seen = []
+    with mapping._watched(job, "SELECT COUNT(*) FROM keypoints", progress):
+        writer = sqlite3.connect(job.database, isolation_level=None, timeout=0)
+        writer.execute("CREATE TABLE keypoints (rows INTEGER)")
+        for _ in range(40):
+            writer.execute("BEGIN EXCLUSIVE")
+            writer.execute("INSERT INTO keypoints VALUES (7)")
+            writer.execute("COMMIT")
+            time.sleep(0.005)
+            seen.append(progress.done)
+        writer.close()
+    assert seen == sorted(seen) and len(set(seen)) > 2
+    assert progress.done == 40
+
+
+@pytest.mark.parametrize(("verbosity", "log_json", "level"), [(0, False, 2), (1, False, 0), (1, True, 2)])
+def test_colmaps_own_log_is_shown_where_asked_for(
+    same_logging: None, verbosity: int, log_json: bool, level: int
+) -> None:
+    configure_logging(verbosity, log_json)
+    log = _pycolmap.load().logging
+    before = log.minloglevel
+    try:
+        _pycolmap.load.__wrapped__()
+        assert log.minloglevel == level
+    finally:
+        log.minloglevel = before
 
 
 def test_a_model_that_is_there_is_left_alone(mapped: Path) -> None:

@@ -21,6 +21,7 @@ from colmap_tco.errors import InputError
 from colmap_tco.fusion import FusionConfig, fuse
 from colmap_tco.maps import read_map
 from colmap_tco.normals import normals_from_depth
+from colmap_tco.origin import hashes
 from colmap_tco.outputs import (
     ViewMaps,
     fusion_views,
@@ -37,7 +38,7 @@ from colmap_tco.outputs import (
     write_view,
 )
 from colmap_tco.ply import read_ply, read_vis
-from colmap_tco.resume import Result, fingerprint, open_result
+from colmap_tco.resume import Origin, Result, fingerprint, open_result
 from colmap_tco.tracks import Observations, Tracks, read_tracks
 from colmap_tco.views import View, ViewConfig, make_views
 from colmap_tco.workspace import DensePaths, Workspace, dense_paths, open_workspace, partial_paths
@@ -141,8 +142,7 @@ def opened(root: Path) -> tuple[Workspace, list[View]]:
 def densify(root: Path, seed: int = 0, overwrite: bool = False, stop_after: int | None = None) -> Result:
     """Every step from workspace to published result; with ``stop_after`` it hangs after so many views."""
     workspace, views = opened(root)
-    key = fingerprint({"seed": seed}, workspace.model_path.iterdir(), [view.path for view in views])
-    result = open_result(root, key, overwrite)
+    result = open_result(root, Origin({"seed": seed}, hashes({v.name: v.path for v in views})), overwrite)
     if result.finished:
         return result
     neighbours = {v.name: [o.name for o in views if o is not v] for v in views}
@@ -396,51 +396,96 @@ def test_a_killed_run_is_continued(workspace: Path) -> None:
 
 def test_a_finished_view_with_a_lost_file_is_made_again(workspace: Path) -> None:
     _, views = opened(workspace)
-    result = open_result(workspace, "key")
+    result = open_result(workspace, origin())
     for view in views[:2]:
         write_view(result.paths, view, maps_of(view))
         result.mark_done({view.name: {}})
     result.paths.normal_map(views[0].name).unlink()
-    again = open_result(workspace, "key")
+    again = open_result(workspace, origin())
     assert not again.is_done(views[0].name)
     assert again.is_done(views[1].name)
 
 
-def test_an_error_says_which_settings_are_others(workspace: Path) -> None:
-    result = open_result(workspace, "one")
-    before = {"settings": {"views": {"max_image_size": 0}, "steps": 10, "num_threads": 1}}
-    write_report(result.paths.report, before)
-    result.publish()
-    now = {"views": {"max_image_size": 384}, "steps": 10, "num_threads": 2}
-    with pytest.raises(InputError, match=r"settings \(max_image_size 0, now 384\); give --overwrite"):
-        open_result(workspace, "two", settings=now)
-    with pytest.raises(InputError, match="from other inputs"):
-        open_result(workspace, "two", settings=before["settings"])
+def origin(seed: int = 1, **others: object) -> Origin:
+    """Of made-up settings, of which ``min_num_pixels`` decides only what follows the maps."""
+    settings = {"seed": seed, "min_num_pixels": 5} | others
+    return Origin(settings, {"picture a.jpg": "1f", "weights": "2e"}, frozenset({"min_num_pixels"}))
 
 
-def test_a_partial_result_of_other_settings_is_dropped(workspace: Path) -> None:
-    result = open_result(workspace, "one")
-    result.mark_done({"a": {}})
+def test_an_error_says_what_is_different(workspace: Path) -> None:
+    first = origin()
+    open_result(workspace, first).publish()
+    with pytest.raises(InputError, match=r"was made with other settings \(seed 1, now 2\); give --overwrite"):
+        open_result(workspace, origin(seed=2))
+    with pytest.raises(InputError, match=r"settings \(added unknown, now true\)"):
+        open_result(workspace, origin(added=True))
+    with pytest.raises(InputError, match=r"made from other inputs \(weights, picture b.jpg\); give"):
+        open_result(
+            workspace, first._replace(inputs={"picture a.jpg": "1f", "weights": "3d", "picture b.jpg": "4c"})
+        )
+    many = {f"picture {i}.jpg": "5b" for i in range(9)}
+    with pytest.raises(InputError, match=r"\(seed 1, now 3\) and from other inputs \(.* and 6 more\)"):
+        open_result(workspace, origin(seed=3)._replace(inputs=many))
+    manifest = dense_paths(workspace).manifest
+    manifest.write_text('{"made_by": "colmap-tco", "format": 1, "fingerprint": "0a"}')
+    with pytest.raises(InputError, match="was made by an earlier version; give --overwrite"):
+        open_result(workspace, first)
+
+
+def one_view_finished(workspace: Path, made_from: Origin) -> Result:
+    """An interrupted run."""
+    view = opened(workspace)[1][0]
+    result = open_result(workspace, made_from)
+    write_view(result.paths, view, maps_of(view))
+    result.mark_done({view.name: {"a": 1}})
+    result.mark_chunk({"loss": [1.5], "seconds": 40.0})
+    return result
+
+
+def test_finished_views_of_an_interrupted_run_are_not_dropped_unasked(workspace: Path) -> None:
+    result = one_view_finished(workspace, origin())
+    manifest = result.paths.manifest.read_bytes()
+    with pytest.raises(InputError, match=r"begun with other settings \(seed 1, now 2\): .*its 1 fin"):
+        open_result(workspace, origin(seed=2))
+    assert result.paths.manifest.read_bytes() == manifest
+    assert open_result(workspace, origin()).views == result.views
+    assert not open_result(workspace, origin(seed=2), overwrite=True).views
+    assert not result.paths.depth_map(next(iter(result.views))).exists()
+
+
+def test_an_interrupted_run_without_a_finished_view_stands_in_nobodys_way(workspace: Path) -> None:
+    result = open_result(workspace, origin())
+    result.mark_done({"a": {}})  # whose files are not there
     (result.paths.root / "left.bin").write_bytes(b"1")
-    assert not open_result(workspace, "two").views
+    assert not open_result(workspace, origin(seed=2)).views
     assert not (result.paths.root / "left.bin").exists()
 
 
 def test_work_on_maps_is_kept_where_only_what_follows_differs(workspace: Path) -> None:
     """In a partial folder and from a published result; not where the maps themselves would differ."""
-    _, views = opened(workspace)
-    result = open_result(workspace, "one", maps="m")
-    write_view(result.paths, views[0], maps_of(views[0]))
-    result.mark_done({views[0].name: {"a": 1}})
-    result.mark_chunk({"loss": [1.5]})
-    again = open_result(workspace, "two", maps="m")
-    assert again.views == {views[0].name: {"a": 1}} and again.chunks == [{"loss": [1.5]}]
+    result = one_view_finished(workspace, origin())
+    (name,) = result.views
+    again = open_result(workspace, origin(min_num_pixels=2))
+    assert again.views == {name: {"a": 1}} and again.chunks == [{"loss": [1.5], "seconds": 40.0}]
     again.publish()
-    third = open_result(workspace, "three", overwrite=True, maps="m")
+    third = open_result(workspace, origin(min_num_pixels=3), overwrite=True)
     assert third.views == again.views and third.chunks == again.chunks and not third.finished
     final, partial = dense_paths(workspace), partial_paths(workspace)
-    assert partial.depth_map(views[0].name).samefile(final.depth_map(views[0].name))
-    assert not open_result(workspace, "three", overwrite=True, maps="n").views
+    assert partial.depth_map(name).samefile(final.depth_map(name))
+    assert not open_result(workspace, origin(seed=2, min_num_pixels=3), overwrite=True).views
+
+
+def test_seconds_of_earlier_runs_are_counted(workspace: Path) -> None:
+    """Those of the chunks and of the model, in every later run; of the other stages the last run's."""
+    result = one_view_finished(workspace, origin())
+    result.mark_mapping(7.5)
+    again = open_result(workspace, origin())
+    again.mark_chunk({"loss": [], "seconds": 2.0})
+    told = {"mapping": 7.5, "workspace": 1.0, "optimisation": 42.0, "fusion": 3.0}
+    assert again.seconds({"workspace": 1.0, "optimisation": 0.1, "fusion": 3.0}) == told
+    again.publish()
+    third = open_result(workspace, origin(min_num_pixels=3), overwrite=True)
+    assert third.seconds({"workspace": 1.0, "optimisation": 0.1, "fusion": 3.0}) == told
 
 
 def test_overwriting_must_be_asked_for_and_replaces_at_the_end(workspace: Path) -> None:
@@ -449,7 +494,7 @@ def test_overwriting_must_be_asked_for_and_replaces_at_the_end(workspace: Path) 
     with pytest.raises(InputError, match="--overwrite"):
         densify(workspace, seed=2)
     assert dense_paths(workspace).manifest.read_bytes() == old
-    result = open_result(workspace, "other", overwrite=True)
+    result = open_result(workspace, origin(), overwrite=True)
     assert dense_paths(workspace).manifest.read_bytes() == old, (
         "the old result stays until the new one is complete"
     )
@@ -461,13 +506,13 @@ def test_overwriting_must_be_asked_for_and_replaces_at_the_end(workspace: Path) 
 
 @pytest.mark.parametrize("published", [True, False])
 def test_a_kill_between_the_renames_loses_nothing(workspace: Path, published: bool) -> None:
-    open_result(workspace, "old").publish()
-    open_result(workspace, "new", overwrite=True)
+    open_result(workspace, origin(1)).publish()
+    open_result(workspace, origin(2), overwrite=True)
     final, partial = dense_paths(workspace).root, partial_paths(workspace).root
     final.rename(workspace / ".dense-tco.old")
     if published:
         partial.rename(final)
-    assert open_result(workspace, "new" if published else "old").finished
+    assert open_result(workspace, origin(2 if published else 1)).finished
     assert not (workspace / ".dense-tco.old").exists()
 
 
@@ -479,13 +524,13 @@ def test_folders_of_others_are_not_touched(workspace: Path, folder: str, manifes
     if manifest is not None:
         (workspace / folder / "manifest.json").write_text(manifest)
     with pytest.raises(InputError, match="not made by"):
-        open_result(workspace, "key", overwrite=True)
+        open_result(workspace, origin(), overwrite=True)
     assert (workspace / folder / "precious").read_text() == "mine"
 
 
 def test_an_empty_partial_folder_is_taken(workspace: Path) -> None:
     partial_paths(workspace).root.mkdir()
-    assert not open_result(workspace, "key").finished
+    assert not open_result(workspace, origin()).finished
 
 
 def test_the_fingerprint_follows_settings_and_inputs(workspace: Path) -> None:
@@ -518,17 +563,19 @@ def test_images_keep_their_format(tmp_path: Path, name: str) -> None:
 
 
 def test_reports_are_plain_json(tmp_path: Path) -> None:
+    """Figures rounded, settings, which are dataclasses, exact."""
+
     @dataclass
     class Part:
         where: Path
         numbers: NDArray[np.float64]
 
-    part = Part(Path("x/y"), np.array([1 / 3, np.nan, np.inf]))
+    part = Part(Path("x/y"), np.array([5400003.25, np.nan, np.inf]))
     write_report(
         tmp_path / "r.json", {"part": part, "n": np.int64(3), "yes": True, "none": None, 4: (1e-9 / 3,)}
     )
     assert json.loads((tmp_path / "r.json").read_text()) == {
-        "part": {"where": "x/y", "numbers": [0.333333, None, None]},
+        "part": {"where": "x/y", "numbers": [5400003.25, None, None]},
         "n": 3,
         "yes": True,
         "none": None,

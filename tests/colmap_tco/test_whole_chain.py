@@ -27,7 +27,7 @@ from colmap_tco.ply import read_ply
 from colmap_tco.predict import predict_chunk
 from colmap_tco.priors import PriorConfig, chunk_frame
 from colmap_tco.tracks import read_tracks
-from colmap_tco.views import View, ViewConfig, make_views
+from colmap_tco.views import View, ViewConfig, canvas_size, make_views
 from colmap_tco.workspace import DensePaths, open_workspace
 from tco.options import ConsensusConfig, TCOConfig
 from tco.types import Prediction, Priors, SparseDepth, Views
@@ -35,6 +35,10 @@ from tests.conftest import Shot, colmap_camera, look_at, write_text_model
 
 Floats = NDArray[np.float64]
 SHOT = Shot((480, 360), "OPENCV", (430.0, 434.0, 251.0, 171.0, -0.12, 0.03, 0.001, -0.002))
+PORTRAIT = Shot((360, 480), "OPENCV", (434.0, 430.0, 171.0, 251.0, -0.12, 0.03, -0.002, 0.001))
+WIDE = Shot((480, 280), "OPENCV", (430.0, 434.0, 247.0, 133.0, -0.12, 0.03, 0.001, -0.002))
+SHOTS = (SHOT, PORTRAIT, SHOT, WIDE, SHOT)
+"""None fills the canvas that they share, so that each is cut out of it at another place."""
 NORMAL = np.array([0.5, 0.35, -1.0]) / np.linalg.norm([0.5, 0.35, -1.0])
 DISTANCE, DARK, BRIGHT = 4.0, 0.0, 0.6
 """Distance of the cameras, and the inverse depths that are drawn black and white."""
@@ -84,16 +88,16 @@ def workspace_of(root: Path, origin: Floats) -> None:
     xy = rng.uniform(-1, 1, (120, 2))
     points = np.c_[xy, -(xy @ NORMAL[:2]) / NORMAL[2]] + origin
     poses = np.stack([pose(i, origin) for i in range(len(NAMES))])
-    write_text_model(root / "sparse" / "0", [SHOT] * len(NAMES), poses, points, 0.0, NAMES)
-    u, v = np.meshgrid(np.arange(480) + 0.5, np.arange(360) + 0.5)
-    rays = _pycolmap.cam_from_img(colmap_camera(SHOT), np.c_[u.ravel(), v.ravel()])
-    for name, move in zip(NAMES, poses, strict=True):
+    write_text_model(root / "sparse" / "0", SHOTS, poses, points, 0.0, NAMES)
+    for name, shot, move in zip(NAMES, SHOTS, poses, strict=True):
+        u, v = np.meshgrid(*(np.arange(side) + 0.5 for side in shot.size))
+        rays = _pycolmap.cam_from_img(colmap_camera(shot), np.c_[u.ravel(), v.ravel()])
         centre = -move[:, :3].T @ move[:, 3] - origin
         inverse = -(np.c_[rays, np.ones(len(rays))] @ move[:, :3] @ NORMAL) / (centre @ NORMAL)
         grey = 255 * (inverse - DARK) / (BRIGHT - DARK)
         assert (grey > 0).all() and (grey < 255).all()
         # Dithered: a rounded grey value would be a staircase of a tenth of a pixel.
-        picture = np.floor(grey + rng.random(grey.shape)).astype(np.uint8).reshape(360, 480)
+        picture = np.floor(grey + rng.random(grey.shape)).astype(np.uint8).reshape(u.shape)
         (root / "images").mkdir(exist_ok=True)
         cv2.imwrite(str(root / "images" / name), picture)
 
@@ -130,7 +134,9 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> tuple[Floats, list[View],
 
 def test_a_plane_keeps_its_place_to_a_fiftieth_of_a_pixel(plain: tuple[Floats, list[View], Path]) -> None:
     points, views, _ = plain
-    assert (views[0].network.width, views[0].network.height) == (160, 120)
+    sizes = [(view.network.width, view.network.height) for view in views]
+    assert sizes == [(160, 120), (120, 160), (160, 120), (160, 96), (160, 120)]
+    assert canvas_size(views) == (160, 160)
     assert views[0].camera.width > 1.05 * SHOT.size[0], "undistortion shall change the size"
     assert len(points) > 10_000
     off = points @ NORMAL / PIXEL
