@@ -97,13 +97,19 @@ def test_points_of_the_made_scene_lie_on_its_wall() -> None:
         torch.testing.assert_close(world[:, 2], torch.full((20,), wall.DEPTH))
 
 
-def test_render_parity(capsys: pytest.CaptureFixture[str]) -> None:
+def test_render_parity(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """The tensor renderer agrees with the compiled one; gsplat says why it cannot run."""
-    render_parity.main(["--device", "cpu", "--size", "30", "40", "--views", "3"])
-    gsplat, pairs = (cells(line) for line in capsys.readouterr().out.splitlines()[-2:])
+    words = ["--device", "cpu", "--size", "30", "40", "--views", "3"]
+    assert render_parity.main(words) == 0
+    header, _, gsplat, pairs = (cells(line) for line in capsys.readouterr().out.splitlines()[-4:])
+    assert len(header) == len(gsplat) == len(pairs)
     assert gsplat[:2] == ["gsplat", "cpu"] and ("gsplat" in gsplat[2] or "CUDA" in gsplat[2])
-    assert pairs[:2] == ["surface_pairs", "surface"]
+    assert pairs[:2] == ["surface_pairs", "surface"] and pairs[-1] == "yes"
     assert all(float(cell) < 1e-4 for cell in pairs[2:9])
+    # An engine that averages where the other composites is far beyond the bounds, and the exit code says so.
+    monkeypatch.setattr(render_parity, "PAIRS", (("surface_pairs", "cpu"),))
+    assert render_parity.main(words) == 1
+    assert cells(capsys.readouterr().out.splitlines()[-1])[-1] == "NO"
 
 
 def test_train_mini_resumes_and_tells_its_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

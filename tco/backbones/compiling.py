@@ -18,9 +18,9 @@ def compiled(backbone: _Backbone, **options: Any) -> _Backbone:
 
     Adapters are forward hooks (:mod:`tco.lora`), and by its default ``torch.compile`` does not look whether
     hooks came or went since it compiled a block: what was compiled before adaptation would go on without the
-    adapters, without a word. So this sets ``torch._dynamo.config.skip_nnmodule_hook_guards`` to False, for the
-    whole process. Blocks of the same shape share their code, which is compiled three times: plain, adapted,
-    and adapted with gradients.
+    adapters, without a word. So this sets ``torch._dynamo.config.skip_nnmodule_hook_guards`` to False, for
+    the whole process. Blocks of the same shape share their code, which is compiled three times: plain,
+    adapted, and adapted with gradients.
 
     Args:
         backbone: one whose decoder is made of lists of blocks, as those of VGGT, π³ and Depth Anything 3 are.
