@@ -61,7 +61,7 @@ def predict_chunks(
     if not todo:
         return {}
     chosen, budget, existing = means
-    backbone, failed = load(chosen), {}
+    backbone, failed = load(chosen._replace(recompute=budget.recompute)), {}
     if len(plan.chunks) > 1:
         log.info("%d views in %d overlapping chunks", sum(len(c.owned) for c in todo), len(todo))
     pictures = Pictures(lambda view, image: _write_picture(result, view, image))
