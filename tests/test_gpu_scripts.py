@@ -11,9 +11,10 @@ import torch
 from benchmarks import backbone, wall
 from benchmarks import rule as by_rule
 from benchmarks.backbone import Timed
-from benchmarks.gpu import network_steps, render_parity, train_mini
+from benchmarks.gpu import network_steps, render_parity, train_mini, train_sweep
 from benchmarks.gpu.rendering import rendering, wait_for
 from tco.backbones.mini import load as load_mini
+from tco.backbones.weights import EMBEDDED, load_sweep
 from tco.optimize import Outcome
 from tests.tco.published import reference, rule
 from training.dataset import read, write
@@ -133,6 +134,30 @@ def test_train_mini_resumes_and_tells_its_errors(tmp_path: Path, capsys: pytest.
     assert (tmp_path / "out" / "table.md").read_text() == told
     with pytest.raises(SystemExit, match="0 samples in"):
         train_mini.main([*words[:-4], "--work", str(tmp_path / "none"), "--out", str(tmp_path / "out")])
+
+
+@pytest.mark.slow
+def test_train_sweep_tells_errors_before_and_after(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One sample many times over, which takes seconds; what was trained has other weights."""
+    data = tmp_path / "work" / "data"
+    words = ["--device", "cpu", "--sizes", "small", "--workers", "1", "--render-minutes", "0",
+             "--minutes", "0.2", "--work", str(data.parent), "--out", str(tmp_path / "out")]  # fmt: skip
+    with pytest.raises(SystemExit, match="0 samples, and 16 are held out"):
+        train_sweep.main(words)
+    write(data, 0, 1, (48, 64), 6)
+    for k in range(1, 20):
+        (data / f"{k:06d}.npz").hardlink_to(data / "000000.npz")
+    train_sweep.main(words)
+    out = capsys.readouterr().out
+    before, after = ([float(x) for x in cells(line)[1:]] for line in out.splitlines()[-2:])
+    assert [cells(line)[0] for line in out.splitlines()[-2:]] == ["before", "after"]
+    assert before != after and all(0 <= share <= 1 for share in (*before[1:], *after[1:]))
+    assert (tmp_path / "out" / "table.md").read_text() == out
+    held_out = sorted(data.glob("*.npz"))[:2]
+    assert train_sweep.scored(EMBEDDED, held_out, (48, 64), "cpu") == pytest.approx(before, abs=1e-3)
+    assert load_sweep(tmp_path / "out" / "weights.safetensors").config == load_sweep().config
 
 
 def test_rendering_keeps_what_is_there_and_leaves_no_parts(tmp_path: Path) -> None:
