@@ -168,8 +168,8 @@ def compute_dtype(device: torch.device) -> torch.dtype:
 def computing(device: torch.device, dtype: torch.dtype) -> AbstractContextManager[object]:
     """Matrix products in ``dtype`` inside the block; norms and residuals stay as they are.
 
-    In float32 convolutions on CUDA are those of cuDNN, which by PyTorch's default rounds their factors to TF32
-    (a relative 5e-4), as in the authors' code; ``torch.backends.cudnn.allow_tf32 = False`` lets it not.
+    In float32 convolutions on CUDA are those of cuDNN, which by PyTorch's default rounds their factors to
+    TF32 (a relative 5e-4), as in the authors' code; ``torch.backends.cudnn.allow_tf32 = False`` forbids it.
     """
     if dtype is torch.float32:
         return _no_autocast(device)

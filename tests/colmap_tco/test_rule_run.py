@@ -22,7 +22,8 @@ from tests.tco.test_vggt import SMALL
 ROOT = Path(__file__).resolve().parents[2]
 SIZES: dict[str, Any] = {"vggt": SMALL, "pi3": NETWORKS["pi3"][3]}
 """VGGT of the reference numbers ``vggt_small``, and a π³ of a few layers."""
-FLAGS = ("--max_image_size", "70", "--steps", "1", "--polish_looks", "1", "--device", "cpu")
+FLAGS = ("--max_image_size", "70", "--steps", "1", "--polish_looks", "1", "--device", "cpu",
+         "--recompute", "always")  # fmt: skip
 
 
 @pytest.mark.slow
@@ -43,6 +44,7 @@ def test_densify_with_weights_by_the_rule(shared: Path, tmp_path: Path, kind: st
     assert done.returncode == PartlyDoneError.exit_code == 6, done.stderr
     told = verdict(done.stdout + done.stderr)
     assert "the depths contradict COLMAP's points (median error" in told and "do not use them" in told
+    assert "its activations are computed again in each backward pass" in done.stderr
     dense = workspace / "dense-tco"
     report = json.loads((dense / "report.json").read_text("utf-8"))
     assert report["backbone"]["name"] == kind and report["images"]["used"] == len(report["views"]) == 15
