@@ -1,14 +1,17 @@
-"""Speed and memory of the published networks with random weights: forward, and the decoding of a TCO step.
+"""Speed and memory of the published networks with random weights: forward, and a step of optimisation.
 
-    python benchmarks/backbone.py [--networks vggt pi3] [--views 2 4 8 16 32] [--size 392 518]
-        [--device cpu] [--dtype float32] [--threads 2] [--repeat 1] [--cpu-time] [--small]
+    python -m benchmarks.backbone [--networks vggt pi3] [--views 2 4 8 16 32] [--size 392 518]
+        [--device cpu] [--dtype float32] [--threads 2] [--repeat 1] [--recompute] [--cpu-time] [--small]
+        [--output FILE]
 
-``forward`` encodes all views and decodes depth, confidence and cameras of all. ``step`` is what test-time
-optimisation does with the network in every step: with low-rank adapters, decode the cameras of all views and
-the depth of one, and go back. The operations are counted from the shapes, on the meta device, without those
-that recomputing adds. The share is of the rate at which the device multiplies matrices of the same dtype,
-measured before and after each row, so that other programs slow both. ``--cpu-time`` divides by the CPU time
-of the process instead of the wall clock, for one thread on a machine that is not idle.
+``forward`` encodes all views and decodes depth, confidence and cameras of all. ``step`` is a step of
+``tco.optimize`` on a made-up scene: with low-rank adapters, decode the cameras of all views and the depth of
+one, render it into four others, compare, go back, and take the step of Adam; the first step is not timed.
+Operations are the network's alone, counted from the shapes on the meta device, without those that recomputing
+adds, so the share of a step counts all else as time lost. The share is of the rate at which the device
+multiplies matrices of the same dtype, measured before and after each row, so that other programs slow both.
+``--cpu-time`` divides by the CPU time of the process instead of the wall clock, for one thread on a machine
+that is not idle. A row that does not fit the memory says so; ``--recompute`` makes steps fit that do not.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +30,16 @@ import torch
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
+from benchmarks.wall import scene
+from colmap_tco.errors import is_out_of_memory
+from colmap_tco.memory import release
+from tco.align import KnownCameras
 from tco.backbones.dinov2 import ViTConfig
 from tco.backbones.pi3 import Pi3, Pi3Config, Pi3Network
 from tco.backbones.vggt import VGGT, VGGTConfig, VGGTNetwork
 from tco.lora import LoRAConfig, adapted
+from tco.optimize import Outcome, optimize
+from tco.options import PolishConfig, TCOConfig
 from tco.types import Priors, Views
 
 SMALL = ViTConfig(64, 2, 2)
@@ -50,6 +60,13 @@ NETWORKS: dict[str, tuple[type[Any], type[Any], Any, Any]] = {
     ),
 }
 """Backbone, network, published sizes, and small ones to try the script with."""
+
+LENGTHS = {"cuda": 8192}
+"""Side of the matrices that a device's rate is measured with; those of a CPU have 2048."""
+
+COLUMNS = (
+    "network", "views", "pass", "seconds", "TFLOP", "GFLOP/s", "matrix rate, GFLOP/s", "share", "peak, GB"
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -97,46 +114,108 @@ def forward(backbone: Any, views: Views) -> None:
         backbone.decode(backbone.encode(views, Priors()))
 
 
-def step(backbone: Any, views: Views) -> Callable[[], None]:
-    """A function that decodes one view with adapters, forward and back; encoding is done here, once."""
-    with torch.no_grad():
-        encoded = backbone.encode(views, Priors())
-        context = backbone.decode(encoded)
-
-    def run() -> None:
-        with adapted(backbone.decoder(), LoRAConfig()):
-            p = backbone.decode(encoded, [0], context)
-            (p.depth.mean() + p.confidence.mean() + p.cameras.world_from_cam.sum()).backward()
-
-    return run
-
-
-def work(backbone: Any, views: Views, kind: str) -> Callable[[], None]:
-    """The function that a row times."""
-    return step(backbone, views) if kind == "step" else lambda: forward(backbone, views)
-
-
 def operations(name: str, small: bool, count: int, size: tuple[int, int], kind: str) -> int:
-    """Floating-point operations of a row; a multiplication and an addition are two."""
+    """Floating-point operations of the network in a row; a multiplication and an addition are two.
+
+    Those of a step are the decoding of one view with adapters, and its way back.
+    """
     with torch.device("meta"):
         backbone, network, *sizes = NETWORKS[name]
         made = backbone(network(sizes[small])).eval().requires_grad_(False)
-    run = work(made, views_of(count, size, "meta"), kind)
-    with FlopCounterMode(display=False) as counter:
-        run()
+    views = views_of(count, size, "meta")
+    if kind == "forward":
+        with FlopCounterMode(display=False) as counter:
+            forward(made, views)
+        return counter.get_total_flops()
+    with torch.no_grad():
+        encoded = made.encode(views, Priors())
+        context = made.decode(encoded)
+    with adapted(made.decoder(), LoRAConfig()), FlopCounterMode(display=False) as counter:
+        p = made.decode(encoded, [0], context)
+        (p.depth.mean() + p.confidence.mean() + p.cameras.world_from_cam.sum()).backward()
     return counter.get_total_flops()
 
 
+@dataclass(frozen=True)
+class Timed:
+    """Seconds of an optimisation, and what came out.
+
+    Attributes:
+        ends: from its start to the end of each step; the first holds encoding and a prediction of all views.
+        after: from the last step to the end, which is a prediction of all views.
+        outcome: the result.
+    """
+
+    ends: tuple[float, ...]
+    after: float
+    outcome: Outcome
+
+    @property
+    def each(self) -> float:
+        """A step: the mean of those after the first, for which kernels may have been chosen or compiled."""
+        return (self.ends[-1] - self.ends[0]) / max(1, len(self.ends) - 1)
+
+    def whole(self, steps: int, refresh: int) -> float:
+        """So many steps, where the depths of all views are computed anew every ``refresh`` steps.
+
+        Where fewer were taken, at most ``refresh``, the rest is extrapolated.
+        """
+        if len(self.ends) == steps:
+            return self.ends[-1] + self.after
+        return self.ends[0] + (steps - 1) * self.each + (1 + (steps - 1) // refresh) * self.after
+
+
+def timed(backbone: Any, views: Views, priors: Priors, config: TCOConfig, clock: Clock) -> Timed:
+    """Optimise, and look at the clock after every step."""
+    ends: list[float] = []
+    start = clock()
+    outcome = optimize(backbone, views, priors, config, report=lambda *_: ends.append(clock() - start))
+    return Timed(tuple(ends), clock() - start - ends[-1], outcome)
+
+
+def steps_of(steps: int) -> TCOConfig:
+    """Steps on the network alone: those on the depths cost the same whatever the network."""
+    return TCOConfig(
+        steps=steps, lora_targets=("qkv", "proj", "fc1", "fc2"), polish=PolishConfig(polish_looks=0)
+    )
+
+
+def seconds(backbone: Any, kind: str, count: int, options: argparse.Namespace, clock: Clock) -> float:
+    """The best of ``--repeat`` passes; before the first, on CUDA, one that is not timed.
+
+    The first step of an optimisation is never timed: kernels may have to be compiled for it.
+    """
+    size = tuple(options.size)
+    if kind == "step":
+        views, priors = (part.to(clock.device) for part in scene(count, size))
+        ends = timed(KnownCameras(backbone), views, priors, steps_of(1 + options.repeat), clock).ends
+        return min(later - earlier for earlier, later in pairwise(ends))
+    torch.manual_seed(0)
+    views, times = views_of(count, size, clock.device), []
+    if clock.device.type == "cuda":
+        forward(backbone, views)
+    for _ in range(options.repeat):
+        start = clock()
+        forward(backbone, views)
+        times.append(clock() - start)
+    return min(times)
+
+
 def matrix_rate(clock: Clock, dtype: torch.dtype, length: int) -> float:
-    """Operations a second of a product of (2 length, length) and (length, length), best of several."""
+    """Operations a second of products of (2 length, length) and (length, length), the best of several.
+
+    A GPU, which is done with one before the next is asked for, gets ten at once and some to warm up.
+    """
     a = torch.randn(2 * length, length, device=clock.device, dtype=dtype)
     b = torch.randn(length, length, device=clock.device, dtype=dtype)
+    at_once = 10 if clock.device.type == "cuda" else 1
     best = float("inf")
     for _ in range(6):
         start = clock()
-        torch.nn.functional.linear(a, b)
+        for _ in range(at_once):
+            torch.nn.functional.linear(a, b)
         best = min(best, clock() - start)
-    return 4 * length**3 / best
+    return at_once * 4 * length**3 / best
 
 
 @contextmanager
@@ -162,25 +241,51 @@ def peak(device: torch.device) -> Iterator[list[float]]:
 
 
 def row(backbone: Any, name: str, kind: str, count: int, options: argparse.Namespace) -> str:
-    """One line of the table."""
+    """One line of the table; where memory does not suffice, it says so."""
     clock = Clock(torch.device(options.device), options.cpu_time)
-    dtype, size = getattr(torch, options.dtype), tuple(options.size)
-    length = 128 if options.small else 2048
-    flop = operations(name, options.small, count, size, kind)
-    torch.manual_seed(0)
-    run = work(backbone, views_of(count, size, clock.device), kind)
-    before, best = matrix_rate(clock, dtype, length), float("inf")
+    try:
+        cells = figures(backbone, name, kind, count, options)
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        cells = ["out of memory", *6 * [""]]
+    release(clock.device)  # after the block: the error held what had been allocated
+    return "| " + " | ".join([name, str(count), kind, *cells]) + " |"
+
+
+def figures(backbone: Any, name: str, kind: str, count: int, options: argparse.Namespace) -> list[str]:
+    """What a row says: seconds, operations, rates, share and peak."""
+    clock = Clock(torch.device(options.device), options.cpu_time)
+    dtype, length = getattr(torch, options.dtype), LENGTHS.get(clock.device.type, 2048)
+    length = 128 if options.small else length
+    before = matrix_rate(clock, dtype, length)
     with peak(clock.device) as memory:
-        for _ in range(options.repeat):
-            start = clock()
-            run()
-            best = min(best, clock() - start)
+        best = seconds(backbone, kind, count, options, clock)
     rate = (before + matrix_rate(clock, dtype, length)) / 2
-    cells = (
-        f"{name} | {count} | {kind} | {best:.2f} | {flop / 1e12:.2f} | {flop / best / 1e9:.0f} | "
-        f"{rate / 1e9:.0f} | {100 * flop / best / rate:.0f} % | {memory[0]:.1f}"
-    )
-    return f"| {cells} |"
+    flop = operations(name, options.small, count, tuple(options.size), kind)
+    share = f"{100 * flop / best / rate:.0f} %"
+    speeds = [f"{flop / 1e12:.2f}", f"{flop / best / 1e9:.0f}", f"{rate / 1e9:.0f}", share]
+    return [f"{best:.2f}", *speeds, f"{memory[0]:.1f}"]
+
+
+def table(options: argparse.Namespace) -> Iterator[str]:
+    """The lines of the table, each as soon as it is known."""
+    height, width = options.size
+    device = torch.device(options.device)
+    again = ", activations computed again" if options.recompute else ""
+    yield f"{width}×{height}, {options.dtype}, {device}, {options.threads} threads{again}"
+    yield ""
+    yield f"| {' | '.join(COLUMNS)} |"
+    yield "|---" * len(COLUMNS) + "|"
+    for name in options.networks:
+        wrap, build, *sizes = NETWORKS[name]
+        network = drawn(lambda build=build, sizes=sizes: build(sizes[options.small]), device)
+        recompute = range(1000) if options.recompute else range(0)
+        backbone = wrap(network, getattr(torch, options.dtype), recompute).eval().requires_grad_(False)
+        for count in options.views:
+            for kind in options.passes:
+                yield row(backbone, name, kind, count, options)
+        del network, backbone
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -199,24 +304,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--cpu-time", action="store_true", help="CPU time of this process, for one thread")
     parser.add_argument("--small", action="store_true", help="networks of a few layers, to try the script")
     parser.add_argument("--recompute", action="store_true", help="recompute all activations in the step")
+    parser.add_argument("--output", type=Path, help="Markdown file to write as well")
     options = parser.parse_args(arguments)
     if options.cpu_time and (options.threads != 1 or options.device != "cpu"):
         parser.error("--cpu-time goes with --device cpu --threads 1")
     torch.set_num_threads(options.threads)
-    height, width = options.size
-    print(f"{width}×{height}, {options.dtype}, {options.device}, {options.threads} threads\n")
-    print("| network | views | pass | seconds | TFLOP | GFLOP/s | matrix rate, GFLOP/s | share | peak, GB |")
-    print("|---|---|---|---|---|---|---|---|---|")
-    for name in options.networks:
-        wrap, build, *sizes = NETWORKS[name]
-        network = drawn(
-            lambda build=build, sizes=sizes: build(sizes[options.small]), torch.device(options.device)
-        )
-        recompute = range(1000) if options.recompute else range(0)
-        backbone = wrap(network, getattr(torch, options.dtype), recompute).eval().requires_grad_(False)
-        for count in options.views:
-            for kind in options.passes:
-                print(row(backbone, name, kind, count, options), flush=True)
+    lines = []
+    for line in table(options):
+        print(line, flush=True)
+        lines.append(line)
+    if options.output is not None:
+        options.output.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -2,16 +2,18 @@
 
 The network runs on tensors without content (PyTorch's ``FakeTensorMode``), which choose the same operations
 as those of a CPU would, and every storage counts from the operation that makes it until it is freed. So
-whole networks at whole size take seconds, wherever this runs. What PyTorch needs inside an operation, the
-process, and the rest of the pipeline are not in it: :mod:`benchmarks.memory` adds what it measures of them.
+whole networks at whole size take seconds, wherever this runs. For CUDA the two things are imitated that it
+does otherwise (:func:`as_on`). What PyTorch needs inside an operation, the process, and the rest of the
+pipeline are not in it: :mod:`benchmarks.memory` adds what it measures of them.
 """
 
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import torch
 from torch import Tensor, nn
@@ -20,8 +22,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from benchmarks.backbone import drawn
-from tco.backbones import da3, mini, pi3, vggt
-from tco.backbones.base import Backbone
+from tco.backbones import da3, mini, pi3, transformer, vggt
 from tco.lora import LoRAConfig, adapted
 from tco.types import Cameras, Priors, Views
 
@@ -35,6 +36,7 @@ NETWORKS: dict[str, tuple[Callable[[Any], nn.Module], Any, Callable[..., Any]]] 
 """Network, published sizes, backbone."""
 IN_EARNEST = ("da3", "da3-small")
 """Networks that ask for values on their way, so that they are run with random weights."""
+EVERY_BLOCK = range(1000)
 STATES = 6
 """Copies of the adapters: themselves, gradients, two moments of Adam, the best state, the one before it."""
 
@@ -46,11 +48,13 @@ class Count(NamedTuple):
         weights: of the network.
         forward: beside them, encoding and then decoding all views.
         optimised: the same, then decoding one view with adapters, and going back.
+        recomputed: the same, where the activations of all blocks are computed again on the way back.
     """
 
     weights: int
     forward: int
     optimised: int
+    recomputed: int
 
 
 class Alive(TorchDispatchMode):
@@ -118,25 +122,54 @@ def fake(backbone: nn.Module) -> None:
                 module._buffers[name] = torch.empty(b.shape, dtype=b.dtype)
 
 
-def count(network: str, dtype: torch.dtype, size: tuple[int, int, int]) -> Count:
-    """Count one size: views, width, height."""
-    n, width, height = size
+@contextmanager
+def as_on(device: str) -> Iterator[None]:
+    """Let a CPU choose types as a device does.
+
+    On CUDA attention is computed in the type of its products, and autocast takes layer norms in float32: the
+    queries and keys that are normalised are kept so.
+    """
+    if device != "cuda":
+        yield
+        return
+    plain = torch.nn.functional.layer_norm
+
+    def layer_norm(x: Tensor, *others: Any, **named: Any) -> Tensor:
+        return plain(x.float() if torch.is_autocast_enabled("cpu") else x, *others, **named)
+
+    with (
+        patch.object(transformer, "attention_dtype", lambda _, products: products),
+        patch.object(torch.nn.functional, "layer_norm", layer_norm),
+    ):
+        yield
+
+
+def count(network: str, dtype: torch.dtype, size: tuple[int, int, int], device: str = "cpu") -> Count:
+    """Count one size: views, width, height; as on a kind of device."""
     module: Any = empty(network, dtype) if network not in IN_EARNEST else random(network, dtype)
-    backbone: Backbone = module
-    with nullcontext() if network in IN_EARNEST else FakeTensorMode():
+    with as_on(device), nullcontext() if network in IN_EARNEST else FakeTensorMode():
         if network not in IN_EARNEST:
             fake(module)
         weights = sum(t.numel() * t.element_size() for t in tensors(module))
-        views = Views(torch.zeros(n, 3, height, width), torch.ones(n, height, width) > 0, ("",) * n)
-        priors = Priors(Cameras(torch.eye(4).repeat(n, 1, 1), torch.eye(3).repeat(n, 1, 1)))
-        with Alive(module) as alive:
-            with torch.no_grad():
-                encoded = backbone.encode(views, priors)
-                context = backbone.decode(encoded)
-            forward = alive.most
-            with adapted(backbone.decoder(), LoRAConfig()) as adapters:
-                found = backbone.decode(encoded, [0], context)
-                cameras = found.cameras
-                (found.depth.sum() + cameras.world_from_cam.sum() + cameras.K.sum()).backward()
-                states = (STATES - 1) * sum(p.numel() * p.element_size() for p in adapters)
-        return Count(weights, forward, alive.most + states)
+        forward, optimised = _alive(module, size)
+        module.recompute = EVERY_BLOCK
+        _, recomputed = _alive(module, size)
+        return Count(weights, forward, optimised, recomputed)
+
+
+def _alive(backbone: Any, size: tuple[int, int, int]) -> tuple[int, int]:
+    """Most bytes beside the weights: of a prediction, and of a step after it."""
+    n, width, height = size
+    views = Views(torch.zeros(n, 3, height, width), torch.ones(n, height, width) > 0, ("",) * n)
+    priors = Priors(Cameras(torch.eye(4).repeat(n, 1, 1), torch.eye(3).repeat(n, 1, 1)))
+    with Alive(backbone) as alive:
+        with torch.no_grad():
+            encoded = backbone.encode(views, priors)
+            context = backbone.decode(encoded)
+        forward = alive.most
+        with adapted(backbone.decoder(), LoRAConfig()) as adapters:
+            found = backbone.decode(encoded, [0], context)
+            cameras = found.cameras
+            (found.depth.sum() + cameras.world_from_cam.sum() + cameras.K.sum()).backward()
+            states = (STATES - 1) * sum(p.numel() * p.element_size() for p in adapters)
+    return forward, alive.most + states

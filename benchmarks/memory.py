@@ -10,9 +10,11 @@ reading weights: memory does not depend on their values. On the CPU the peak is 
 once the network is there, on CUDA that of PyTorch's allocator.
 
 Published networks are too large to be measured at many sizes. Their own tensors are counted
-(:mod:`benchmarks.counting`), and added to what everything else takes, which is measured with a network of
-three numbers, ``pipeline``; ``--check`` measures the sum. Their matrix products are in the type that
-``--dtype`` names, which a CPU without bfloat16 would run in float32.
+(:mod:`benchmarks.counting`) for the kind of device that ``--device`` names, which need not be there, and
+added to what everything else takes, which is measured with a network of three numbers, ``pipeline``;
+``--check`` measures the sum. Their matrix products are in the type that ``--dtype`` names, which a CPU
+without bfloat16 would run in float32. The mode ``recomputed`` is ``optimised`` with activations computed
+again.
 """
 
 from __future__ import annotations
@@ -52,13 +54,14 @@ CHECKED: dict[str, tuple[Size, ...]] = {
     "mini": ((3, 136, 96), (2, 280, 208)),
 }
 """What they are checked with."""
-MODES = {"forward": 0, "optimised": 1}
+MODES = {"forward": 0, "optimised": 1, "recomputed": 1}
 """Steps; one passes every place that allocates, where the views are tied to each other from the first."""
 POLISH_LOOKS = 1
 """On the depths after them; the first already holds all that the later ones do."""
-COPIES = 1.2
-"""Measured over counted bytes of an optimised network's tensors, for VGGT-1B and π³ at the sizes that are
-checked: kernels copy operands, and freed memory is not always used again."""
+COPIES = {"cpu": 1.2, "cuda": 1.0}
+"""Measured over counted bytes of an optimised network's tensors. On a CPU for VGGT-1B and π³ at the sizes
+that are checked: kernels copy operands, and freed memory is not always used again. PyTorch's allocator on
+CUDA counts what tensors take, which is what is counted here; that was not measured yet."""
 
 
 @dataclass(frozen=True)
@@ -83,13 +86,13 @@ def main() -> None:
     task = parser.add_mutually_exclusive_group()
     task.add_argument("--write", action="store_true", help="put the fits into colmap_tco/_footprints.py")
     task.add_argument("--check", action="store_true", help="compare predictions with measurements")
-    task.add_argument("--one", nargs=5, metavar=("NETWORK", "VIEWS", "WIDTH", "HEIGHT", "STEPS"))
+    task.add_argument("--one", nargs=5, metavar=("NETWORK", "VIEWS", "WIDTH", "HEIGHT", "MODE"))
     options = parser.parse_args()
     place = (options.device, options.dtype)
     if options.one:
-        network, *numbers = options.one
-        views, width, height, steps = map(int, numbers)
-        print(json.dumps(measured_here(network, place, (views, width, height), steps)))
+        network, *numbers, mode = options.one
+        views, width, height = map(int, numbers)
+        print(json.dumps(measured_here(network, place, (views, width, height), mode)))
         return
     column = "predicted MB | predicted / measured" if options.check else "fitted MB | fitted / measured"
     print(f"| network | device | mode | views | canvas | measured MB | {column} |\n" + "|---" * 8 + "|")
@@ -108,13 +111,17 @@ def compare(options: argparse.Namespace, place: tuple[str, str]) -> None:
     from colmap_tco.memory import footprint
 
     for network in options.networks:
-        for mode in options.modes:
-            steps = MODES[mode]
-            needs = footprint(network, place[0], steps, place[1])
+        for mode in modes(network, options):
+            needs = footprint(network, place[0], MODES[mode], place[1], recompute=mode == "recomputed")
             for asked in options.sizes or CHECKED[network]:
-                peak, _ = measured(network, place, asked, steps)
+                peak, _ = measured(network, place, asked, mode)
                 key = (network, where(network, place), mode)
                 show(key, asked, peak, needs.bytes(peak.views, peak.pixels))
+
+
+def modes(network: str, options: argparse.Namespace) -> list[str]:
+    """Those that were asked for and that the network has."""
+    return [mode for mode in options.modes if mode != "recomputed" or network in COUNTED]
 
 
 def refit(options: argparse.Namespace, place: tuple[str, str]) -> None:
@@ -124,16 +131,17 @@ def refit(options: argparse.Namespace, place: tuple[str, str]) -> None:
     fits, counts, process = dict(_footprints.FITS), dict(_footprints.COUNTS), _footprints.PROCESS
     for network in options.networks:
         sizes = options.sizes or FITTED[network]
-        for mode in options.modes:
+        found_by_size = [counted(network, place, asked) for asked in sizes] if network in COUNTED else []
+        for mode in modes(network, options):
             key = (network, where(network, place), mode)
             if network in COUNTED:
-                pairs = [counted(network, place[1], asked, mode) for asked in sizes]
+                pairs = [(found[mode], weights) for found, weights in found_by_size]
                 fit = with_weights(fitted([peak for peak, _ in pairs]), pairs[0][1])
-                counts[network, place[1], mode] = fit
+                counts[network, key[1], mode] = fit
                 peaks = [Peak(peak.views, peak.pixels, peak.bytes + weights) for peak, weights in pairs]
             else:
-                found = [measured(network, place, asked, MODES[mode]) for asked in sizes]
-                peaks, process = [peak for peak, _ in found], found[-1][1]
+                runs = [measured(network, place, asked, mode) for asked in sizes]
+                peaks, process = [peak for peak, _ in runs], runs[-1][1]
                 fit = fits[key] = fitted(peaks)
             for asked, peak in zip(sizes, peaks, strict=True):
                 show(key, asked, peak, predicted(fit, peak))
@@ -141,16 +149,20 @@ def refit(options: argparse.Namespace, place: tuple[str, str]) -> None:
                 TABLE.write_text(source(process, fits, counts))
 
 
-def counted(network: str, dtype: str, asked: Size, mode: str) -> tuple[Peak, int]:
-    """Bytes of the network's tensors beside its weights, and of these."""
+def counted(network: str, place: tuple[str, str], asked: Size) -> tuple[dict[str, Peak], int]:
+    """Bytes of the network's tensors beside its weights, in each mode, and of these."""
     import torch
 
     from benchmarks.counting import count
 
-    found = count(network, getattr(torch, dtype), asked)
+    device, dtype = place
+    found = count(network, getattr(torch, dtype), asked, device)
     views, width, height = asked
-    alive = COPIES * found.optimised if MODES[mode] else found.forward
-    return Peak(views, width * height, round(alive)), found.weights
+    bytes_of = {"forward": found.forward, "optimised": found.optimised, "recomputed": found.recomputed}
+    return {
+        mode: Peak(views, width * height, round(alive * (COPIES[device] if MODES[mode] else 1)))
+        for mode, alive in bytes_of.items()
+    }, found.weights
 
 
 def with_weights(fit: tuple[float, float, float], weights: float) -> tuple[float, float, float]:
@@ -169,9 +181,9 @@ def show(key: tuple[str, str, str], asked: Size, peak: Peak, guess: float) -> No
     print("| " + " | ".join([*key, *cells, f"{guess / peak.bytes:.2f}"]) + " |", flush=True)
 
 
-def measured(network: str, place: tuple[str, str], asked: Size, steps: int) -> tuple[Peak, float]:
+def measured(network: str, place: tuple[str, str], asked: Size, mode: str) -> tuple[Peak, float]:
     """Peak of a process of its own, and the bytes of a process without a network."""
-    words = [network, *map(str, (*asked, steps))]
+    words = [network, *map(str, asked), mode]
     options = ["--device", place[0], "--dtype", place[1], "--one", *words]
     command = [sys.executable, "-m", "benchmarks.memory", *options]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -213,7 +225,7 @@ def source(process: float, fits: Fits, counts: Fits) -> str:
             *table("FITS", fits),
             f'"""Measured: (network, device, forward or optimised) → {rows}"""\n',
             *table("COUNTS", counts),
-            f'"""Counted: (network, type of products, mode) → the same, beside that of {PIPELINE}."""\n',
+            f'"""Counted: (network, device:products, mode) → the same, beside that of {PIPELINE}."""\n',
         ]
     )
 
@@ -232,10 +244,11 @@ def number(x: float) -> str:
     return f"{x:.1f}" if x < 1e4 else f"{x:.3e}".replace("e+", "e")
 
 
-def measured_here(network: str, place: tuple[str, str], asked: Size, steps: int) -> dict[str, Any]:
+def measured_here(network: str, place: tuple[str, str], asked: Size, mode: str) -> dict[str, Any]:
     """Peak of this process, which must do nothing else."""
     import torch
 
+    from benchmarks.counting import EVERY_BLOCK
     from colmap_tco.memory import canvas_pixels
 
     device = torch.device(place[0])
@@ -243,8 +256,12 @@ def measured_here(network: str, place: tuple[str, str], asked: Size, steps: int)
         tracks, views = chunk(Path(folder), asked)
         process = resident("VmRSS")
         backbone = made(network, device, getattr(torch, place[1]))
+        if mode == "recomputed":
+            backbone.recompute = EVERY_BLOCK
         forget_peak()
-        run(backbone, tracks, views, device, steps)
+        if device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats()
+        run(backbone, tracks, views, device, MODES[mode])
     peak = torch.cuda.max_memory_allocated() if device.type == "cuda" else resident("VmHWM")
     return {"views": len(views), "pixels": canvas_pixels(views), "bytes": peak, "process": process}
 

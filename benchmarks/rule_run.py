@@ -2,58 +2,54 @@
 
     python -m benchmarks.rule_run [--networks vggt pi3] [--set office] [--work DIR] [-- FLAG …]
 
-Writes a checkpoint with the authors' names and shapes (5.0 and 3.8 GB; ``../shared/parity``), runs the
-command on a copy of a shared set with it, and prints a Markdown table: exit code, seconds, peak memory,
-which outputs are there, and what the run says of its quality. Weights made by a rule know nothing, so the
-run must say that the result contradicts COLMAP's points, and must not end with 0.
+Writes a checkpoint with the authors' names and shapes (5.0 and 3.8 GB; :mod:`benchmarks.rule`), runs the
+command on a copy of a shared set with it, one for each network, and prints a Markdown table: exit code,
+seconds, peak memory, which outputs are missing, and what the run says of its quality. Weights made by a rule
+know nothing, so the run must say that the result contradicts COLMAP's points, and must not end with 0.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import sys
 from pathlib import Path
-from types import ModuleType
+from typing import Any
 
-from benchmarks.quality import SHARED, copied, measured
+import numpy as np
+import torch
+from torch import nn
 
-PARITY = SHARED / "parity"
-REFERENCES = {"vggt": "vggt_1b", "pi3": "pi3_large"}
-CONSTANTS = {"image_mean": (0.485, 0.456, 0.406), "image_std": (0.229, 0.224, 0.225)}
-OUTPUTS = (
-    "fused.ply", "fused.ply.vis", "report.json", "sparse/cameras.bin", "sparse/images.bin", "images",
-    "stereo/fusion.cfg", "stereo/patch-match.cfg", "stereo/depth_maps", "stereo/normal_maps",
-)  # fmt: skip
+from benchmarks.backbone import NETWORKS
+from benchmarks.quality import copied, measured
+from benchmarks.rule import array
+from colmap_tco.workspace import DensePaths
+
 FLAGS = ("--steps", "2", "--max_image_size", "112", "--device", "cpu")
 
 
-def rule() -> ModuleType:
-    """The rule that makes weights from names."""
-    spec = importlib.util.spec_from_file_location("rule_weights", PARITY / "rule_weights.py")
-    if spec is None or spec.loader is None:
-        raise SystemExit(f"{PARITY}: the reference numbers are not there")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def write_weights(network: str, path: Path) -> None:
-    """A checkpoint of a published network, as its authors name its tensors."""
-    import numpy as np
+def write_weights(network: nn.Module, path: Path) -> None:
+    """A checkpoint of a network whose tensors may be on no device, named as its authors name them."""
     from safetensors.numpy import save_file
 
-    table = json.loads((PARITY / f"{REFERENCES[network]}.json").read_text("utf-8"))
-    make, tensors = rule().rule_array, {}
-    for name, shape in table["state_dict"].items():
-        if name in CONSTANTS:
-            tensors[name] = np.reshape(np.array(CONSTANTS[name], np.float32), shape)
-        else:
-            tensors[name] = np.ascontiguousarray(make(name, tuple(shape), table["salt"]))
+    shapes = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     part = path.with_suffix(".part")
-    save_file(tensors, part)
+    save_file({name: np.ascontiguousarray(array(name, shape)) for name, shape in shapes.items()}, part)
     part.replace(path)
+
+
+def lacking(dense: Path, report: dict[str, Any]) -> list[str]:
+    """What a dense workspace should hold by its report, and does not."""
+    paths = DensePaths(dense)
+    every = [
+        paths.ply, paths.vis, paths.report, paths.page, paths.fusion_cfg, paths.patch_match_cfg,
+        *(paths.sparse / f"{name}.bin" for name in ("cameras", "images", "points3D")),
+    ]  # fmt: skip
+    for name, view in report["views"].items():
+        if view["state"] == "used":
+            maps = (paths.depth_map, paths.normal_map, paths.confidence_map, paths.error_map, paths.image)
+            every += [*(path(name) for path in maps), *paths.own_maps(name)]
+    return [str(path.relative_to(dense)) for path in every if not path.is_file()]
 
 
 def verdict(text: str) -> str:
@@ -70,7 +66,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--networks", nargs="+", default=list(REFERENCES), choices=list(REFERENCES))
+    parser.add_argument("--networks", nargs="+", default=list(NETWORKS), choices=list(NETWORKS))
     parser.add_argument("--set", default="office", help="one of ../shared/data")
     parser.add_argument("--work", type=Path, default=Path("runs/rule"))
     args = parser.parse_args(own)
@@ -80,19 +76,16 @@ def main() -> None:
     for network in args.networks:
         weights = args.work / f"{network}-rule.safetensors"
         if not weights.exists():
-            write_weights(network, weights)
-        workspace = copied(args.set, args.work)
+            _, build, published, _ = NETWORKS[network]
+            with torch.device("meta"):
+                made = build(published)
+            write_weights(made, weights)
+        workspace = copied(args.set, args.work / network)
         command = [sys.executable, "-m", "colmap_tco", "densify", str(workspace), "--overwrite"]
         done = measured([*command, "--backbone", network, "--weights", str(weights), *rest])
         dense = workspace / "dense-tco"
         report = json.loads((dense / "report.json").read_text("utf-8"))
-        views = report["images"]["used"]
-        missing = [name for name in OUTPUTS if not (dense / name).exists()]
-        missing += [
-            f"{views - count} of {kind}"
-            for kind in ("depth_maps", "normal_maps")
-            if (count := len(list((dense / "stereo" / kind).glob("*.geometric.bin")))) != views
-        ]
+        missing = lacking(dense, report)
         out.write(
             f"| {network} | {done.code} | {done.seconds:.0f} | {done.peak:.1f} | {len(report['chunks'])} "
             f"| {', '.join(missing) or 'none'} | {report['points']} | {verdict(done.text)} |\n"

@@ -17,6 +17,7 @@ from colmap_tco.memory import (
     chunk_limit,
     footprint,
     free_memory,
+    recomputed,
 )
 from colmap_tco.published import NETWORKS, PUBLISHED, Network
 from colmap_tco.views import View
@@ -30,6 +31,9 @@ if TYPE_CHECKING:
     from tco.backbones.base import Backbone
 
 log = logging.getLogger(__name__)
+
+EVERY_BLOCK = range(1000)
+"""Of a network whose activations are computed again."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,13 @@ class NetworkConfig:
         "views that are optimised together; 0: as many as fit 70 % of the free memory, at most 128 with "
         "sweep and 40 with the others",
     )
+    recompute: str = knob(
+        "auto",
+        "compute what the backward pass needs of the network's blocks again there, instead of keeping it: a "
+        "tenth of the memory for each view of vggt, a sixth of pi3, for a third more time. auto: where fewer "
+        "views would fit a chunk otherwise. sweep has no such blocks",
+        choices=("auto", "always", "never"),
+    )
 
     def __post_init__(self) -> None:
         check_range(self, "chunk_size", 0)
@@ -70,12 +81,14 @@ class Selected(NamedTuple):
         weights: its file.
         device: where it runs.
         reason: why this one, as a sentence for the user.
+        recompute: whether activations are computed again in the backward pass.
     """
 
     network: Network
     weights: Path
     device: torch.device
     reason: str
+    recompute: bool = False
 
     def describe(self) -> dict[str, object]:
         """For the report."""
@@ -98,6 +111,7 @@ class Budget:
         device: whose memory counts.
         given: what the user asked for; 0: nothing.
         most: views of a chunk of this network.
+        recompute: whether activations are computed again in the backward pass.
     """
 
     needs: Footprint
@@ -105,13 +119,15 @@ class Budget:
     device: torch.device
     given: int
     most: int
+    recompute: bool = False
 
     @classmethod
     def of(cls, chosen: Selected, views: Sequence[View], config: NetworkConfig, steps: int) -> Budget:
         """For these views, and so many steps of optimisation."""
-        needs = footprint(chosen.network.name, chosen.device.type, steps)
-        most = chosen.network.most_views
-        return cls(needs, canvas_pixels(views), chosen.device, config.chunk_size, most)
+        pixels, most = canvas_pixels(views), chosen.network.most_views
+        place = (chosen.network, chosen.device, steps)
+        needs, again = needed(place, (len(views), pixels), config)
+        return cls(needs, pixels, chosen.device, config.chunk_size, most, again)
 
     def views(self) -> int:
         """Views a chunk to plan with."""
@@ -124,6 +140,23 @@ class Budget:
         if self.given:
             return max(FEWEST_VIEWS, self.given)
         return max(FEWEST_VIEWS, int(self.needs.views(self.pixels, free_memory(self.device))))
+
+
+def needed(
+    place: tuple[Network, torch.device, int], size: tuple[int, int], config: NetworkConfig
+) -> tuple[Footprint, bool]:
+    """Memory of a network, on a device with so many steps, and whether it computes activations again.
+
+    Args:
+        place: network, device, steps of optimisation.
+        size: how many views there are in all, and the pixels of their canvas.
+        config: what the user asked for.
+    """
+    (network, device, steps), (views, pixels) = place, size
+    wanted = config.chunk_size or min(views, network.most_views)
+    room = (wanted, pixels, free_memory(device))
+    again = recomputed(network.name, device.type, steps, room, config.recompute)
+    return footprint(network.name, device.type, steps, recompute=again), again
 
 
 def choose_device(name: str) -> torch.device:
@@ -168,7 +201,7 @@ def select(config: NetworkConfig) -> Selected:
             f"--backbone {network.name} runs from packages that are not installed "
             f"({', '.join(network.missing())}): {network.install}"
         )
-    return Selected(network, path, device, reason)
+    return Selected(network, path, device, reason, config.recompute == "always")
 
 
 def _owner(path: Path) -> Network:
@@ -205,8 +238,8 @@ def _best(device: torch.device) -> tuple[Network, str]:
     free = free_memory(device)
     for name in ready:
         network = NETWORKS[name]
-        need = footprint(name, device.type, steps=1).bytes(FEWEST_VIEWS, network.image_size**2)
-        if need < free:
+        least = footprint(name, device.type, steps=1, recompute=True)
+        if least.bytes(FEWEST_VIEWS, network.image_size**2) < free:
             return network, f"auto: fetched, and {gigabytes(free)} of {device} are enough for it"
     return sweep, f"auto: {gigabytes(free)} free on {device} are too little for {' or '.join(ready)}"
 
@@ -233,10 +266,13 @@ def load(selected: Selected) -> Backbone:
     module, _, name = network.loader.partition(":")
     loader: Callable[..., Backbone] = getattr(import_module(module), name)
     try:
-        backbone = loader(selected.weights, device=selected.device)
+        again = {"recompute": EVERY_BLOCK} if selected.recompute and network.recomputes else {}
+        backbone = loader(selected.weights, device=selected.device, **again)
     except WeightsError as error:
         raise MissingError(str(error)) from error
     log.info("network %s (%s); %s", network.name, network.title, selected.reason)
+    if again:
+        log.info("its activations are computed again in each backward pass, to fit more views a chunk")
     if network.checkpoint is not None:
         c = network.checkpoint
         log.info("its weights are %s", selected.weights)

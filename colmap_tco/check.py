@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from colmap_tco._pycolmap import Camera, registered
-from colmap_tco.backbones import NetworkConfig, Selected, choose_device, select
+from colmap_tco.backbones import NetworkConfig, Selected, choose_device, needed, select
 from colmap_tco.errors import InputError, MissingError
-from colmap_tco.memory import FEWEST_VIEWS, SHARE, Footprint, chunk_limit, footprint, free_memory
+from colmap_tco.memory import FEWEST_VIEWS, SHARE, chunk_limit, free_memory
 from colmap_tco.pinhole import Pinhole, undistorted_camera
 from colmap_tco.progress import Progress
 from colmap_tco.published import NETWORKS, Network
 from colmap_tco.views import ViewConfig, network_size
-from colmap_tco.weights import cached, gigabytes
+from colmap_tco.weights import accepted, cached, gigabytes
 from colmap_tco.workspace import (
     WorkspaceConfig,
     choose_model,
@@ -53,6 +53,7 @@ class Need:
         bytes: peak memory with such chunks.
         measured: whether the footprint was measured on such a device.
         state: whether it can run now, and what it lacks.
+        recompute: whether activations would be computed again in the backward pass.
     """
 
     network: Network
@@ -61,6 +62,7 @@ class Need:
     bytes: int
     measured: bool
     state: str
+    recompute: bool
 
 
 @dataclass(frozen=True)
@@ -162,24 +164,44 @@ def _need(network: Network, device: torch.device, cameras: Sequence[Pinhole], co
     canvases = [network_size(camera, longest, network.stride) for camera in cameras]
     canvas = max(w for w, _ in canvases), max(h for _, h in canvases)
     pixels, free = canvas[0] * canvas[1], free_memory(device)
-    needs, given = footprint(network.name, device.type, config.tco.steps), config.network.chunk_size
+    given, place = config.network.chunk_size, (network, device, config.tco.steps)
+    needs, again = needed(place, (len(cameras), pixels), config.network)
     limit = max(FEWEST_VIEWS, given) if given else chunk_limit(needs, pixels, free, network.most_views)
     chunk = min(limit, len(cameras))
-    state = _state(network, needs, pixels, free)
-    return Need(network, canvas, chunk, needs.bytes(chunk, pixels), bool(needs.measured), state)
+    state = _state(network, config.network.weights, needs.bytes(FEWEST_VIEWS, pixels), free)
+    return Need(network, canvas, chunk, needs.bytes(chunk, pixels), bool(needs.measured), state, again)
 
 
-def _state(network: Network, needs: Footprint, pixels: int, free: int) -> str:
-    """Whether a network could run now."""
-    if network.training:
+def _state(network: Network, file: str, least: int, free: int) -> str:
+    """Whether a network could run now, with a file that the user named or those on this machine."""
+    if network.missing():
+        return f"needs {', '.join(network.missing())}, not installed: {network.install}"
+    c = network.checkpoint
+    if file and _kind(Path(file).expanduser()) != network.kind:
+        return "the file named with --weights is not of it"
+    if not file and network.training:
         return f"no weights yet: {network.training}"
-    if network.checkpoint is not None and cached(network.checkpoint) is None:
-        c = network.checkpoint
+    if not file and c is not None and cached(c) is None:
         return f"not fetched ({gigabytes(c.size)}, {c.licence}): colmap-tco weights fetch {network.name}"
-    least = needs.bytes(FEWEST_VIEWS, pixels)
     if least > free:
         return f"does not fit: {gigabytes(least)} for {FEWEST_VIEWS} views, {gigabytes(free)} to be had"
+    if not file and not accepted(network):
+        return (
+            f"ready with --backbone {network.name}; auto leaves it out until its licence is accepted: "
+            f"colmap-tco weights fetch {network.name} --accept_licence"
+        )
     return "ready"
+
+
+def _kind(file: Path) -> str:
+    """The kind of network that a file of weights is of; empty if it is of none, or not whole."""
+    from tco.backbones.identify import identify
+    from tco.backbones.weights import WeightsError
+
+    try:
+        return identify(file).network
+    except WeightsError:
+        return ""
 
 
 def _choice(config: CheckConfig, needs: Sequence[Need]) -> str:
@@ -191,6 +213,7 @@ def _choice(config: CheckConfig, needs: Sequence[Need]) -> str:
     by_name: Mapping[str, Any] = {need.network.name: need for need in needs}
     need = by_name[chosen.network.name]
     return (
-        f"densify would run {chosen.network.name} ({chosen.reason}) in chunks of up to {need.chunk} views, "
+        f"densify would run {chosen.network.name} ({chosen.reason}) in chunks of up to {need.chunk} views"
+        f"{', their activations computed again in each backward pass' if need.recompute else ''}, "
         f"which take {gigabytes(need.bytes)}; planned for {SHARE:.0%} of what is free now"
     )

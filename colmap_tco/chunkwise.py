@@ -71,7 +71,7 @@ def predict_chunks(
     if not todo:
         return {}
     chosen, budget, existing, threads = means
-    backbone, failed = _loaded(chosen, settings[1]), {}
+    backbone, failed = _loaded(chosen._replace(recompute=budget.recompute), settings[1]), {}
     if len(plan.chunks) > 1:
         log.info("%d views in %d overlapping chunks", sum(len(c.owned) for c in todo), len(todo))
     pictures = Pictures(lambda view, image: _write_picture(result, view, image))

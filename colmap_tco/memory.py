@@ -55,19 +55,24 @@ class Footprint:
         return (room - self.fixed - pixels * self.per_step) / (pixels * self.per_view)
 
 
-def footprint(network: str, device: str, steps: int, dtype: str | None = None) -> Footprint:
+def footprint(
+    network: str, device: str, steps: int, dtype: str | None = None, recompute: bool = False
+) -> Footprint:
     """Of a network (a key of :data:`colmap_tco.published.NETWORKS`) on a kind of device.
 
     Args:
         network: its name.
         device: ``cpu``, ``cuda``, …. Where a network was not measured on it, it is taken to need there what
-            it needs on the CPU, less the process, which is not in the device's memory.
+            it needs on the CPU, less the process, which is not in the device's memory. The tensors of
+            published networks are counted as they are on a CPU and on CUDA.
             The type in which a device multiplies matrices counts: bfloat16 takes half of float32.
         steps: of optimisation; 0 takes less.
         dtype: of the products of published networks, if it is not that in which the device takes them.
+        recompute: whether activations are computed again in the backward pass, by networks that can.
     """
     kind, mode = network.removesuffix("-commercial"), "optimised" if steps else "forward"
-    counts = _footprints.COUNTS.get((kind, dtype or _products(device), mode))
+    where = f"{'cuda' if device == 'cuda' else 'cpu'}:{dtype or _products(device)}"
+    counts = _footprints.COUNTS.get((kind, where, "recomputed" if steps and recompute else mode))
     measured = kind if counts is None else PIPELINE
     place = device if (measured, device, mode) in _footprints.FITS else "cpu"
     fixed, per_view, per_step = _footprints.FITS[measured, place, mode]
@@ -77,6 +82,23 @@ def footprint(network: str, device: str, steps: int, dtype: str | None = None) -
     return Footprint(
         fixed + more[0], per_view + more[1], per_step + more[2], measured=place if place == device else ""
     )
+
+
+def recomputed(network: str, device: str, steps: int, room: tuple[int, int, int], choice: str) -> bool:
+    """Whether activations are to be computed again in the backward pass, which takes a third more time.
+
+    Args:
+        network: a key of :data:`colmap_tco.published.NETWORKS`; some have nothing to compute again.
+        device: its kind.
+        steps: of optimisation; without any there is no backward pass.
+        room: views wanted in a chunk, pixels of the canvas, and bytes that are free.
+        choice: ``always``, ``never``, or ``auto``: if else fewer views than wanted would fit.
+    """
+    views, pixels, free = room
+    plain, less = (footprint(network, device, steps, recompute=again) for again in (False, True))
+    if choice == "never" or plain == less:
+        return False
+    return choice == "always" or plain.views(pixels, SHARE * free) < views
 
 
 def _products(device: str) -> str:

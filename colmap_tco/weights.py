@@ -65,7 +65,8 @@ def weights(action: str, name: str | None, config: WeightsConfig, progress: Prog
     path = Path(config.weights).expanduser() if config.weights else located(network)
     if action == "verify":
         verify(path, network, checkpoint, progress)
-        return Told(f"{path}: whole, and as published ({checkpoint.repository}, {checkpoint.licence})")
+        c = checkpoint
+        return Told(f"{path}: whole, and as published ({c.repository}, {c.licence}, SHA-256 {c.sha256})")
     return Told(str(path))
 
 
@@ -81,17 +82,17 @@ def _published(name: str | None) -> tuple[Network, Checkpoint]:
 
 
 def table() -> str:
-    """All networks, with repository, size, licence, and where their weights are on this machine."""
-    rows = [("network", "size", "licence", "repository", "weights")]
+    """All networks, with repository, size, licence, beginning of the SHA-256, and where their weights are."""
+    rows = [("network", "size", "licence", "repository", "SHA-256", "weights")]
     for network in NETWORKS.values():
         c = network.checkpoint
         if c is None:
             state = f"none yet: {network.training}" if network.training else "in the package"
-            rows.append((network.name, "", "Apache-2.0", "", state))
+            rows.append((network.name, "", "Apache-2.0", "", "", state))
             continue
         path = cached(c)
         state = str(path) if path else f"not fetched: colmap-tco weights fetch {network.name}"
-        rows.append((network.name, gigabytes(c.size), c.licence, c.repository, state))
+        rows.append((network.name, gigabytes(c.size), c.licence, c.repository, c.sha256[:12] + "…", state))
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
     terms = [f"{name}: {c.licence}, {c.terms}; {c.licence_url}" for name, (_, c) in PUBLISHED.items()]

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import pickle
+import struct
 import typing
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,6 +18,8 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from tco.backbones.weights import WeightsError, read_file
+
+logger = logging.getLogger(__name__)
 
 _Config = TypeVar("_Config")
 _Network = TypeVar("_Network", bound=nn.Module)
@@ -27,6 +32,20 @@ ZIP = b"PK\x03\x04"
 NETWORK = "network"
 """Key of the network's name in that metadata, where the names of the tensors do not tell."""
 
+MOST_HEADER = 100_000_000
+"""Bytes of the longest header that the format of safetensors allows."""
+
+FOREIGN = {
+    b"version https://git-lfs": "a pointer of Git LFS",
+    b"\x80": "a Python pickle, which could run code when it is read",
+    b"GGUF": "a GGUF file of a language model",
+    b"\x93NUMPY": "an array of numpy",
+    b"\x89HDF": "an HDF5 file",
+    b"\x1f\x8b": "a file compressed by gzip",
+    b"%PDF": "a PDF document",
+}
+"""Beginning → what is often found in place of weights, and is none."""
+
 
 def load_network(
     path: Path,
@@ -38,7 +57,8 @@ def load_network(
     """A network on the CPU with the tensors of a file.
 
     Tensors that keep their type are not copied but read when they are first used. If some change theirs, all
-    are copied, a few at a time, so that the memory never holds much more than the network.
+    are copied, a few at a time, so that the memory never holds much more than the network. A file in half or
+    double precision is taken as float32, in which the networks are published.
 
     Args:
         path: a file that :func:`read` reads.
@@ -60,11 +80,13 @@ def load_network(
         network = build(config)
     used = {name: tensor for name, tensor in tensors.items() if not name.startswith(skipped or ("\0",))}
     check(network, _with_tied(network, used), path)
+    change = _other_types(network, used, path)
     if products is not None and products[1] is not torch.float32:
         modules, dtype = products
-        change = linear_names(network, modules(network))
+        change.update(dict.fromkeys(linear_names(network, modules(network)), dtype))
+    if change:
         del tensors
-        used = dict(_copies(path, list(used), change, dtype))
+        used = dict(_copies(path, list(used), change))
     network.load_state_dict(_with_tied(network, used), assign=True)
     return network
 
@@ -80,8 +102,18 @@ def linear_names(network: nn.Module, modules: Iterable[nn.Module]) -> set[str]:
     }
 
 
+def _other_types(network: nn.Module, tensors: Mapping[str, Tensor], path: Path) -> dict[str, torch.dtype]:
+    """Name → type in the network, of the tensors that have another one in the file."""
+    want = {name: t.dtype for name, t in network.state_dict().items()}
+    other = {name: want[name] for name, t in tensors.items() if t.dtype is not want[name]}
+    if other:
+        kinds = sorted({str(tensors[name].dtype).removeprefix("torch.") for name in other})
+        logger.info("%s: %d tensors in %s are taken as float32", path, len(other), " and ".join(kinds))
+    return other
+
+
 def _copies(
-    path: Path, names: Sequence[str], change: Collection[str], dtype: torch.dtype
+    path: Path, names: Sequence[str], change: Mapping[str, torch.dtype]
 ) -> Iterator[tuple[str, Tensor]]:
     """Copies of tensors of a file, some of them in another type.
 
@@ -93,7 +125,7 @@ def _copies(
         tensors, _ = read(path)
         for name in names[k : k + every]:
             tensor = tensors[name]
-            yield name, tensor.to(dtype if name in change else tensor.dtype, copy=True)
+            yield name, tensor.to(change.get(name, tensor.dtype), copy=True)
 
 
 def _with_tied(network: nn.Module, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -136,28 +168,52 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         raise WeightsError(f"{path}: no such file of weights")
     with path.open("rb") as file:
         head = file.read(512)
-    if head.startswith(ZIP):
-        return _read_torch(path), {}
-    foreign = _kind(head)
-    if foreign and head[8:9] != b"{":  # the length that safetensors begins with can be any bytes
+    if header_length(head) is not None:
+        return read_file(path)
+    foreign = _archive(path) if head.startswith(ZIP) else _kind(head)
+    if foreign:
         raise WeightsError(
             f"{path}: this is {foreign}, not weights in the format of safetensors or torch.save; "
             "fetch the file itself"
         )
-    return read_file(path)
+    return _read_torch(path), {}
 
 
-def _kind(head: bytes) -> str | None:
-    """What a file is that begins so, if it is something often found in place of weights."""
+def header_length(head: bytes) -> int | None:
+    """Bytes of the table that a safetensors file which begins so has in front; None if it is no such file."""
+    if len(head) < 9 or head[8:9] != b"{":
+        return None
+    length = int(struct.unpack("<Q", head[:8])[0])
+    return length if length <= MOST_HEADER else None
+
+
+def _kind(head: bytes) -> str:
+    """What a file is that begins so, and neither as safetensors nor as an archive."""
     if not head:
         return "an empty file"
-    if head.startswith(b"version https://git-lfs"):
-        return "a pointer of Git LFS"
-    if head.lstrip()[:1] == b"<":
+    for beginning, kind in FOREIGN.items():
+        if head.startswith(beginning):
+            return kind
+    text = head.lstrip()
+    if text[:1] == b"<":
         return "a web page"
-    if head.startswith(b"\x80"):
-        return "a Python pickle, which could run code when it is read"
-    return None
+    if any(byte < 32 and byte not in b"\t\n\r\f" for byte in head):
+        return f"a file of another format, which begins with {head[:4]!r}"
+    return "a JSON text" if text[:1] in (b"{", b"[") else "a text"
+
+
+def _archive(path: Path) -> str:
+    """What an archive is that is not of ``torch.save``; empty if it is, or is not whole."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+    except zipfile.BadZipFile:
+        return ""
+    if any(name.endswith("data.pkl") for name in names):
+        return ""
+    if any(name.endswith(".npy") for name in names):
+        return "a set of numpy's arrays (.npz)"
+    return f"an archive of other files ({', '.join(names[:3]) or 'empty'})"
 
 
 def _read_torch(path: Path) -> dict[str, Tensor]:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tco.backbones.checkpoints import CONFIG, NETWORK, read
+from tco.backbones.checkpoints import CONFIG, NETWORK, header_length, read
 from tco.backbones.weights import WeightsError
 
 SIGNATURES: dict[str, tuple[str, ...]] = {
@@ -21,9 +20,6 @@ SIGNATURES: dict[str, tuple[str, ...]] = {
 
 OWN = ("mini",)
 """Networks that have the names of a published one and tell themselves apart in the file's metadata."""
-
-_MOST_HEADER = 100_000_000
-"""The format allows no longer header."""
 
 
 @dataclass(frozen=True)
@@ -64,35 +60,34 @@ def identify(path: Path) -> Contents:
     if header is None:
         tensors, info = read(path)
         return Contents(_network(tensors, info), tuple(tensors), size)
-    info = header.pop("__metadata__", {})
-    end = max((int(entry["data_offsets"][1]) for entry in header.values()), default=0)
-    whole = end + 8 + _length(path)
+    length, table = header
+    info = table.pop("__metadata__", None)
+    try:
+        end = max((int(entry["data_offsets"][1]) for entry in table.values()), default=0)
+        tags = {str(key): str(value) for key, value in (info or {}).items()}
+    except (TypeError, KeyError, IndexError, ValueError, AttributeError) as error:
+        raise WeightsError(f"{path}: {_DAMAGED}") from error
+    whole = end + 8 + length
     if size != whole:
         raise WeightsError(
             f"{path}: {size} bytes of a safetensors file of {whole}, so its copy or download was cut off "
             "or mixed up; fetch or copy it again"
         )
-    return Contents(_network(header, info), tuple(header), size)
+    return Contents(_network(table, tags), tuple(table), size)
 
 
-def _length(path: Path) -> int:
-    """Bytes of the header that a safetensors file begins with."""
-    with path.open("rb") as file:
-        return int(struct.unpack("<Q", file.read(8))[0])
+_DAMAGED = "a safetensors file with a damaged header; fetch or copy it again"
 
 
-def _header(path: Path, size: int) -> dict[str, Any] | None:
-    """The table in front of a safetensors file, or None if the file does not begin with one.
+def _header(path: Path, size: int) -> tuple[int, dict[str, Any]] | None:
+    """Length and content of the table in front of a safetensors file, or None if there is none.
 
     Raises:
         WeightsError: it begins as a table that is not whole.
     """
     with path.open("rb") as file:
-        head = file.read(9)
-        if len(head) < 9 or head[8:] != b"{":
-            return None
-        length = struct.unpack("<Q", head[:8])[0]
-        if length > _MOST_HEADER:
+        length = header_length(file.read(9))
+        if length is None:
             return None
         text = b"{" + file.read(length - 1)
     if len(text) < length:
@@ -103,10 +98,8 @@ def _header(path: Path, size: int) -> dict[str, Any] | None:
     try:
         table: dict[str, Any] = json.loads(text)
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise WeightsError(
-            f"{path}: a safetensors file with a damaged header; fetch or copy it again"
-        ) from error
-    return table
+        raise WeightsError(f"{path}: {_DAMAGED}") from error
+    return length, table
 
 
 def _network(names: Iterable[str], info: dict[str, str]) -> str:

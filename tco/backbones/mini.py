@@ -99,7 +99,7 @@ def load(
     Raises:
         WeightsError: the file is missing, damaged, or of another network.
     """
-    network = load_network(path, VGGTNetwork, MINI).float()
+    network = load_network(path, VGGTNetwork, MINI)
     if network.config.points:
         raise WeightsError(f"{path}: weights of a VGGT with a head for points; --backbone vggt takes those")
     place = torch.device(device)

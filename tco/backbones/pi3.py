@@ -5,7 +5,7 @@
 own, and only relative poses mean something. Depth is the z of the local point map. The network predicts no
 intrinsics: they are a centred pinhole camera whose focal length is recovered from the local point map.
 
-``torch.compile`` can be applied to the blocks: ``for b in backbone.decoder(): b.compile()``.
+:func:`tco.backbones.compiling.compiled` applies ``torch.compile`` to the blocks.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ network's error), and the scale is the network's own. Its intrinsics are fields 
 so they hold for any convention of pixel centres; only its published unprojection assumes integer centres,
 and that is not used here.
 
-``torch.compile`` can be applied to the blocks: ``for b in network.aggregator.blocks(): b.compile()``.
+:func:`tco.backbones.compiling.compiled` applies ``torch.compile`` to the blocks.
 """
 
 from __future__ import annotations

@@ -150,6 +150,36 @@ def test_a_file_of_weights_runs_the_network_that_it_is_of(tmp_path: Path, kind: 
     assert str(chosen.describe()["licence"]).startswith(licences.get(kind, "CC BY-NC 4.0: no commercial use"))
 
 
+@pytest.mark.parametrize("kind", TINY)
+def test_networks_compute_activations_again_where_that_is_asked_for(tmp_path: Path, kind: str) -> None:
+    path = written(tmp_path / "mine.safetensors", kind)
+    for choice, blocks in (("always", 1000), ("auto", 0), ("never", 0)):
+        chosen = select(NetworkConfig(backbone=kind, weights=str(path), device="cpu", recompute=choice))
+        assert len(load(chosen).recompute) == blocks  # type: ignore[attr-defined]
+    load(select(NetworkConfig(device="cpu", recompute="always")))  # the one in the package has none
+
+
+@pytest.mark.parametrize("gigabytes", [2, 80])
+def test_auto_takes_a_published_network_where_cuda_has_the_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gigabytes: int
+) -> None:
+    """The device is asked for its free memory and nothing else, so none is needed here."""
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: (gigabytes * 10**9, 10**11))
+    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda _: 0)
+    cuda = torch.device("cuda")
+    for name in ("pi3", "vggt"):
+        fetched(tmp_path, name)
+        assert _best(cuda)[0].name == ("sweep" if name == "pi3" or gigabytes < 80 else "pi3")
+        _note_accepted(*PUBLISHED[name])
+    network, reason = _best(cuda)
+    if gigabytes < 80:
+        assert network.name == "sweep"
+        assert reason == "auto: 2.0 GB free on cuda are too little for vggt or pi3"
+    else:
+        assert network.name == "vggt"
+        assert reason == "auto: fetched, and 80.0 GB of cuda are enough for it"
+
+
 @pytest.mark.parametrize("name", ["da3", "da3-small"])
 def test_a_package_that_is_not_installed_is_told_with_the_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str

@@ -15,11 +15,12 @@ from colmap_tco.check import CheckConfig, check
 from colmap_tco.errors import InputError, MissingError
 from colmap_tco.memory import canvas_pixels, footprint
 from colmap_tco.progress import Progress
-from colmap_tco.published import NETWORKS
+from colmap_tco.published import NETWORKS, PUBLISHED
 from colmap_tco.views import ViewConfig, make_views
+from colmap_tco.weights import _note_accepted
 from colmap_tco.workspace import open_workspace
 from tco.options import TCOConfig
-from tests.colmap_tco.test_backbones import empty_cache, written
+from tests.colmap_tco.test_backbones import empty_cache, fetched, written
 
 if TYPE_CHECKING:
     from tests.conftest import Room
@@ -42,9 +43,8 @@ def test_every_network_is_told_with_its_need_and_its_state(room: Room) -> None:
     assert "7 images registered in " in text and "densify would run on cpu" in text
     assert "densify would run sweep (auto: no weights" in text
     for need in found.needs:
-        assert need.bytes == footprint(need.network.name, "cpu", 40).bytes(
-            need.chunk, need.size[0] * need.size[1]
-        )
+        needs = footprint(need.network.name, "cpu", 40, recompute=need.recompute)
+        assert need.bytes == needs.bytes(need.chunk, need.size[0] * need.size[1])
 
 
 def test_it_plans_as_densify_does(make_workspace: Callable[..., Path], shot: type, tmp_path: Path) -> None:
@@ -61,6 +61,24 @@ def test_it_plans_as_densify_does(make_workspace: Callable[..., Path], shot: typ
     assert forward.bytes <= need.bytes
     larger = check(root, replace(PLAIN, views=ViewConfig(max_image_size=64)), Progress()).needs[0]
     assert max(larger.size) == 64
+
+
+def test_activations_computed_again_are_planned_as_densify_does(room: Room, tmp_path: Path) -> None:
+    file = str(written(tmp_path / "w.safetensors", "vggt"))
+    plain = NetworkConfig(backbone="vggt", weights=file, device="cpu")
+    told, bytes_of = {}, {}
+    for choice in ("always", "never"):
+        config = replace(PLAIN, network=replace(plain, recompute=choice))
+        found = check(room.root, config, Progress())
+        need = next(need for need in found.needs if need.network.name == "vggt")
+        told[choice], bytes_of[choice] = found.choice, need.bytes
+        chosen = select(config.network)
+        views, _ = make_views(open_workspace(room.root), ViewConfig(), chosen.network.stride, 518)
+        budget = Budget.of(chosen, views, config.network, steps=config.tco.steps)
+        assert budget.recompute is need.recompute is (choice == "always")
+        assert budget.needs.bytes(need.chunk, budget.pixels) == need.bytes
+    assert bytes_of["always"] < bytes_of["never"]
+    assert "activations computed again" in told["always"] and "again" not in told["never"]
 
 
 def test_bare_images_are_enough(room: Room, tmp_path: Path) -> None:
@@ -82,5 +100,25 @@ def test_what_would_stop_densify_is_told(room: Room, tmp_path: Path) -> None:
     file = str(written(tmp_path / "w.safetensors", "pi3"))
     mine = replace(PLAIN, network=NetworkConfig(weights=file, device="cpu"))
     assert f"densify would run pi3 ({file} holds weights of pi3)" in check(room.root, mine, Progress()).choice
+    states = {need.network.name: need.state for need in check(room.root, mine, Progress()).needs}
+    assert states["pi3"] == "ready"
+    assert {states[name] for name in ("sweep", "vggt")} == {"the file named with --weights is not of it"}
     with pytest.raises(MissingError, match="--device cuda:99"):
         check(room.root, replace(PLAIN, network=NetworkConfig(device="cuda:99")), Progress())
+
+
+def test_ready_is_what_densify_runs(room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fetched weights do not suffice: auto asks for the licence, and da3 for its authors' package."""
+
+    def state(name: str) -> str:
+        return next(n.state for n in check(room.root, PLAIN, Progress()).needs if n.network.name == name)
+
+    fetched(tmp_path, "pi3")
+    assert state("pi3").startswith(
+        "ready with --backbone pi3; auto leaves it out until its licence is accepted"
+    )
+    _note_accepted(*PUBLISHED["pi3"])
+    assert state("pi3") == "ready"
+    monkeypatch.setitem(NETWORKS, "da3", replace(NETWORKS["da3"], modules=("no_such_module",)))
+    fetched(tmp_path, "da3")
+    assert state("da3").startswith("needs no_such_module, not installed: pip install")

@@ -238,6 +238,12 @@ def test_the_list_names_repositories_sizes_and_licences(tmp_path: Path) -> None:
     assert "5.0 GB" in lines["vggt"] and "3.8 GB" in lines["pi3"]
 
 
+def test_the_list_tells_which_bytes_are_meant() -> None:
+    lines = {line.split()[0]: line for line in table().splitlines() if line}
+    for name, (_, c) in PUBLISHED.items():
+        assert f"{c.repository}  " in lines[name] and f"  {c.sha256[:12]}…  " in lines[name]
+
+
 def test_the_list_tells_how_to_install_what_a_network_runs_from(monkeypatch: pytest.MonkeyPatch) -> None:
     da3 = NETWORKS["da3"]
     line = f"da3: pip install 'colmap-tco[da3]' && {da3.install.partition(' && ')[2]}"

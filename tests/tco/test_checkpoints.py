@@ -172,6 +172,28 @@ def test_another_network_is_refused(tmp_path: Path) -> None:
         pi3.load(path)
 
 
+@pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.float64])
+@pytest.mark.parametrize("products", [torch.float32, torch.bfloat16])
+@torch.no_grad()
+def test_a_file_in_another_precision_is_taken_as_float32(
+    tmp_path: Path, kind: torch.dtype, products: torch.dtype, caplog: pytest.LogCaptureFixture
+) -> None:
+    backbone = tiny_vggt()
+    path = tmp_path / "half.safetensors"
+    save(path, tiny_vggt().network.to(kind), TINY_VGGT)
+    with caplog.at_level("INFO"):
+        back = vggt.load(path, "cpu", products)
+    name = str(kind).removeprefix("torch.")
+    assert f"{path}: {len(back.network.state_dict())} tensors in {name} are taken as float32" in caplog.text
+    head = back.network.depth_head.scratch.output_conv1.weight
+    rounded = backbone.network.depth_head.scratch.output_conv1.weight.to(kind).float()
+    assert head.dtype is torch.float32 and torch.equal(head, rounded)
+    assert back.network.aggregator.frame_blocks[0].attn.qkv.weight.dtype is products
+    a, b = (x.decode(x.encode(some_views(), vggt.Priors())).depth for x in (backbone, back))
+    assert b.dtype is torch.float32
+    assert float((a.log() - b.log()).norm() / a.log().norm()) < 0.05
+
+
 def test_metadata_of_another_kind_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.safetensors"
     for text in ("{", "[1]", '{"wavelets": 3}', "7"):
@@ -196,7 +218,11 @@ FOREIGN = {
     "a web page": b"<!DOCTYPE html><html>404</html>",
     "a pointer of Git LFS": b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 5\n",
     "a Python pickle": pickle.dumps({"weight": [1, 2, 3]}),
-    "not a complete safetensors file": b"a text of no format at all, but long enough to have a header",
+    "a text": b"a text of no format at all, but long enough to have a header",
+    "a JSON text": b'{"abcd":{"a table": [1, 2, 3], "that": "looks like the header of safetensors"}}',
+    "a GGUF file": b"GGUF\x03\0\0\0{" + 100 * b"\0",
+    "an array of numpy": b"\x93NUMPY\x01\0v\0{'descr': '<f4'}" + 100 * b"\0",
+    "another format, which begins with b'ab\\\\x00c'": b"ab\0cdefghijkl",
     "not a complete file of torch.save": b"PK\x03\x04" + 500 * b"\0",
 }
 

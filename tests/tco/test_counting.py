@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import nn
@@ -45,5 +47,22 @@ def test_counting_without_content_gives_what_running_gives(
     assert without.weights == sum(4 * t.numel() for t in tensors(counting.random(name, torch.float32)))
     assert without.forward == pytest.approx(running.forward, rel=0.05)
     assert without.optimised == pytest.approx(running.optimised, rel=0.05)
+    assert without.recomputed == pytest.approx(running.recomputed, rel=0.05)
+    assert without.recomputed < without.optimised
     larger = count(name, torch.float32, (6, 56, 42))
     assert running.forward < larger.forward and running.optimised < larger.optimised < 3 * running.optimised
+
+
+def test_types_are_those_of_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In bfloat16 CUDA keeps less for attention and more for norms; in float32 all is alike.
+
+    Wide enough that the activations of the blocks are most of what is kept.
+    """
+    wide = replace(TINY_VGGT, channels=128, encoder=replace(TINY_VGGT.encoder, channels=128))
+    monkeypatch.setitem(counting.NETWORKS, "vggt", (VGGTNetwork, wide, VGGT))
+    size, plain = (4, 112, 112), torch.nn.functional.layer_norm
+    for dtype, same in ((torch.float32, True), (torch.bfloat16, False)):
+        cpu, cuda = (count("vggt", dtype, size, device) for device in ("cpu", "cuda"))
+        assert (cpu == cuda) is same
+        assert cuda.optimised == cpu.optimised if same else cuda.optimised < 0.97 * cpu.optimised
+    assert torch.nn.functional.layer_norm is plain

@@ -6,6 +6,7 @@ import json
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -68,6 +69,11 @@ def test_every_cut_is_seen(tmp_path: Path) -> None:
         identify(path)
 
 
+def headed(table: str) -> bytes:
+    """A safetensors file of a header alone."""
+    return len(table).to_bytes(8, "little") + table.encode()
+
+
 @pytest.mark.parametrize(
     ("content", "told"),
     [
@@ -76,6 +82,14 @@ def test_every_cut_is_seen(tmp_path: Path) -> None:
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:0", "a pointer of Git LFS"),
         (b"\x80\x04\x95whatever", "a Python pickle, which could run code"),
         (b"\x20\0\0\0\0\0\0\0{not json}" + b" " * 40, "damaged header"),
+        (headed('{"a": {"dtype": "F32", "shape": [1]}}'), "damaged header"),
+        (headed('{"a": {"data_offsets": null}}'), "damaged header"),
+        (headed('{"a": {"data_offsets": [0]}}'), "damaged header"),
+        (headed('{"a": 3}'), "damaged header"),
+        (headed('{"__metadata__": [1]}'), "damaged header"),
+        (b'{"model_type": "vggt"}', "a JSON text"),
+        (b"weights will be published soon\n", "a text"),
+        (b"GGUF\x03\0\0\0", "a GGUF file"),
         (b"PK\x03\x04 and then nothing", r"not a complete file of torch\.save"),
     ],
 )
@@ -85,6 +99,11 @@ def test_what_is_not_weights_is_called_by_its_name(tmp_path: Path, content: byte
         identify(tmp_path / "file")
 
 
+def test_a_header_without_metadata_is_whole(tmp_path: Path) -> None:
+    (tmp_path / "w").write_bytes(headed('{"__metadata__": null}'))
+    assert identify(tmp_path / "w").network == ""
+
+
 def test_files_that_are_not_there_and_folders_and_foreign_archives(tmp_path: Path) -> None:
     with pytest.raises(WeightsError, match="none: no such file"):
         identify(tmp_path / "none")
@@ -92,8 +111,11 @@ def test_files_that_are_not_there_and_folders_and_foreign_archives(tmp_path: Pat
         identify(tmp_path)
     with zipfile.ZipFile(tmp_path / "pictures.zip", "w") as archive:
         archive.writestr("a.txt", "a")
-    with pytest.raises(WeightsError, match=r"pictures\.zip: "):
+    with pytest.raises(WeightsError, match=r"pictures\.zip: this is an archive of other files \(a\.txt\)"):
         identify(tmp_path / "pictures.zip")
+    np.savez(tmp_path / "arrays.npz", a=np.zeros(3))
+    with pytest.raises(WeightsError, match=r"arrays\.npz: this is a set of numpy's arrays"):
+        identify(tmp_path / "arrays.npz")
     torch.save({"model": {"a": torch.zeros(1)}, "epoch": 3}, tmp_path / "training.pt")
     with pytest.raises(
         WeightsError, match="expected a plain table of tensors by name, found entries model, epoch"

@@ -427,27 +427,6 @@ def test_errors_name_the_cause() -> None:
         render(surfels(), cams, SIZE)
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="this test is about machines without CUDA")
-def test_gsplat_without_cuda_says_what_to_do() -> None:
-    with pytest.raises(RuntimeError, match="gsplat"):
-        render(surfels(), cameras(), SIZE, "gsplat")
-
-
-def _gsplat_runs() -> bool:
-    import importlib.util
-
-    return torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
-
-
-@pytest.mark.skipif(not _gsplat_runs(), reason="gsplat and CUDA are not both here")
-@pytest.mark.parametrize("name", ["surfels", "at_borders"])
-def test_gsplat_agrees_with_the_twin(name: str) -> None:
-    scene = SCENES[name]().to("cuda", torch.float32)
-    ours = render(scene, cameras().to("cuda", torch.float32), SIZE, "gsplat")
-    twin = render(SCENES[name](), cameras(), SIZE, "twin")
-    torch.testing.assert_close(ours.color.cpu().double(), twin.color, atol=1e-3, rtol=1e-3)
-
-
 @pytest.mark.skipif(not PARITY.exists(), reason="the published numbers are not beside this checkout")
 @pytest.mark.parametrize("engine", ["cpu", "twin"])
 def test_parity_with_gsplat(engine: str) -> None:

@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from benchmarks.claim import BOTH, ROWS, figures, line, prepared, settings, table
-from benchmarks.gpu.network_steps import DEPTH, scene
 from benchmarks.real import RealSet
 from benchmarks.tables import cell, interval
+from benchmarks.wall import DEPTH, scene
 from colmap_tco.backbones import Selected
 from colmap_tco.bench.methods import Reconstruction, check_row
 from colmap_tco.bench.rows import parse_rows
