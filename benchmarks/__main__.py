@@ -83,7 +83,7 @@ def source(table: Table) -> str:
     """A text that changes with what a table is made of: code, weights and arguments."""
     code = [path for part in ("tco", "colmap_tco", "benchmarks") for path in (ROOT / part).rglob("*.py")]
     settings = {"script": table.script, "arguments": table.arguments, "part": table.part}
-    return fingerprint(settings, [located(NETWORKS["sweep"]), *code], ())
+    return fingerprint(settings, [located(NETWORKS["sweep"]), *code])
 
 
 def is_made(table: Table, folder: Path) -> bool:

@@ -28,20 +28,16 @@ _MADE_BY = "colmap-tco"
 _FORMAT = 1
 
 
-def fingerprint(settings: Mapping[str, object], contents: Iterable[Path], files: Iterable[Path]) -> str:
+def fingerprint(settings: Mapping[str, object], contents: Iterable[Path] = ()) -> str:
     """A text that changes when the result would.
 
     Args:
         settings: everything that decides the result, as JSON can hold it.
-        contents: files whose bytes count (the model, masks).
-        files: files of which name, size and time of change count (images).
+        contents: files whose names and bytes count.
     """
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for path in sorted(contents):
         digest.update(path.name.encode() + hashlib.sha256(path.read_bytes()).digest())
-    for path in sorted(files):
-        status = path.stat()
-        digest.update(f"{path.name} {status.st_size} {status.st_mtime_ns}\n".encode())
     return digest.hexdigest()
 
 

@@ -37,8 +37,10 @@ def test_network_steps(network: str, capsys: pytest.CaptureFixture[str]) -> None
     network_steps.main([*SMALL, "--networks", network, "--views", "3", "4", "--steps", "3", "--timed", "2"])
     rows = told(capsys.readouterr().out, network)
     assert [r[:3] for r in rows] == [
-        [f"{network}, published", "3", "0"], [f"{network}, ours", "3", "0"], [f"{network}, ours", "4", "0"]
-    ]  # fmt: skip
+        [f"{network}, published schedule", "3", "0"],
+        [f"{network}, ours", "3", "0"],
+        [f"{network}, ours", "4", "0"],
+    ]
     assert [r[3].partition(" ")[2] for r in rows] == ["", "", "extrapolated from 2 steps"]
     for r in rows:
         # The colours were compared in the first and in the last step, and nothing was rolled back.
@@ -61,7 +63,7 @@ def test_a_network_that_does_not_fit_says_so_and_the_next_one_follows(
     out = capsys.readouterr().out
     rows = told(out, "vggt") + told(out, "pi3")
     assert [r[0] for r in rows] == [
-        f"{name}, {schedule}" for name in ("vggt", "pi3") for schedule in ("published", "ours")
+        f"{name}, {schedule}" for name in ("vggt", "pi3") for schedule in ("published schedule", "ours")
     ]
     assert all(r[3] == "out of memory" for r in rows)
     backbone.main([*far, "--device", "cpu", "--small", "--views", "2"])

@@ -85,8 +85,11 @@ def rows(kind: str, options: argparse.Namespace) -> Iterator[str]:
         ours = steps_of(options.steps if i == 0 else min(options.steps, options.timed))
         made.recompute = range(options.recomputed(count))
         if i == 0:
-            published = ours.reference_schedule()
-            yield row(Uncached(backbone), f"{kind}, published", count, published, options)
+            published, label = ours.reference_schedule(), f"{kind}, published schedule"
+            if options.objective != "ours":
+                theirs = replace(ours.ablation, published_objective=True, renderer=options.objective)
+                published, label = replace(ours, ablation=theirs).reference_schedule(), f"{kind}, published"
+            yield row(Uncached(backbone), label, count, published, options)
         yield row(backbone, f"{kind}, ours", count, ours, options)
 
 
@@ -103,6 +106,10 @@ def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--timed", type=int, choices=range(2, 11), default=4,
         help="steps that are taken with all but the first number of views: fewer than 11, as the depths of "
         "all views are computed anew then",
+    )  # fmt: skip
+    parser.add_argument(
+        "--objective", choices=["ours", "cpu", "gsplat"], default="ours",
+        help="of the published schedule; cpu and gsplat: the published one, rendered by that engine",
     )  # fmt: skip
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--dtype", choices=["float32", "bfloat16"], default="bfloat16")

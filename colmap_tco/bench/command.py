@@ -161,7 +161,7 @@ def _open(config: BenchConfig) -> _Run:
         raise InputError(f"--scenes {lacking[0]}: {config.root} has {', '.join(there)}")
     chosen = select(config.network)
     made_with = {
-        "weights": f"{chosen.weights.name}, {fingerprint({}, [chosen.weights], ())}",
+        "weights": f"{chosen.weights.name}, {fingerprint({}, [chosen.weights])}",
         "version": versions()["colmap-tco"],
     }
     folder = config.output / f"{config.dataset}-{setting}-{chosen.network.name}"

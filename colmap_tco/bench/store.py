@@ -74,7 +74,7 @@ def read_result(
         old, result = saved["settings"], Result(**saved["result"])
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: no result of this command ({error}); remove it, or --overwrite") from error
-    if saved["fingerprint"] != fingerprint({**settings, "format": FORMAT}, (), ()):
+    if saved["fingerprint"] != fingerprint({**settings, "format": FORMAT}):
         changed = sorted(k for k in {*old, *settings} if old.get(k) != json.loads(_json(settings.get(k))))
         raise InputError(
             f"{path} was made with other settings ({', '.join(changed) or 'of another version'}); give "
@@ -98,7 +98,7 @@ def stored(folder: Path) -> list[tuple[str, str]]:
 def write_result(folder: Path, settings: Mapping[str, Any], result: Result) -> None:
     """Keep a result, atomically."""
     content = {
-        "fingerprint": fingerprint({**settings, "format": FORMAT}, (), ()),
+        "fingerprint": fingerprint({**settings, "format": FORMAT}),
         "settings": settings,
         "result": vars(result),
     }
