@@ -148,8 +148,9 @@ def _asked(
             said, weights = _words(sample(theirs, xy), z, depth, config.consensus_reach)
             said = torch.cat([torch.log(own / depth)[None], said])
             weights = torch.cat([confidence[None, band], weights])
-            depth = depth * torch.exp(robust_mean(said, weights, config.consensus_width))
-        found.append(torch.stack([depth, standard_error(said, weights)]))
+            middle = weighted_median(said, weights)
+            depth = depth * torch.exp(robust_mean(said, weights, config.consensus_width, middle))
+        found.append(torch.stack([depth, standard_error(said, weights, middle)]))
     depth, error = torch.cat(found, 1).reshape(2, h, w)
     return depth, error
 
@@ -174,24 +175,25 @@ def _words(there: Tensor, z: Tensor, depth: Tensor, reach: float) -> tuple[Tenso
     return said, there[:, 1] * (depth / z) * asked
 
 
-def robust_mean(values: Tensor, weights: Tensor, width: float) -> Tensor:
-    """Mean (N,) of what is near the weighted median of values (K, N), along K.
+def robust_mean(values: Tensor, weights: Tensor, width: float, middle: Tensor) -> Tensor:
+    """Mean (N,) of what is near the weighted median m of values (K, N), along K; ``middle`` is m (1, N).
 
-    Around the median m, a value v of weight w counts w / (1 + ((v − m) / width)²).
+    A value v of weight w counts w / (1 + ((v − m) / width)²).
     """
-    off = values - weighted_median(values, weights)
+    off = values - middle
     near = weights / (1 + (off / width) ** 2)
     return (near * values).sum(0) / near.sum(0)
 
 
-def standard_error(values: Tensor, weights: Tensor) -> Tensor:
+def standard_error(values: Tensor, weights: Tensor, middle: Tensor) -> Tensor:
     """Standard error (N,) of what values (K, N) say together, along K, by their spread: s √(π / 2n).
 
-    s is 1.4826 times the weighted median distance from the weighted median, times n / (n − 0.8) since one
-    of few values is at no distance (Croux and Rousseeuw 1992), and n = (Σ w)² / Σ w². That is the median's,
-    and a little more than that of :func:`robust_mean`. Infinite where n is not above ``FEWEST``.
+    s is 1.4826 times the weighted median distance from the weighted median, ``middle`` (1, N), times
+    n / (n − 0.8) since one of few values is at no distance (Croux and Rousseeuw 1992), and n = (Σ w)² / Σ w².
+    That is the median's, and a little more than that of :func:`robust_mean`. Infinite where n is not above
+    ``FEWEST``.
     """
-    off = (values - weighted_median(values, weights)).abs()
+    off = (values - middle).abs()
     spread = SIGMA_OF_MAD * weighted_median(off, weights, upper=True).squeeze(0)
     count = weights.sum(0) ** 2 / (weights**2).sum(0).clamp_min(1e-30)
     enough = count > FEWEST

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from tco import consensus
-from tco.consensus import agreed, robust_mean, smooth, standard_error
+from tco.consensus import agreed, smooth, weighted_median
 from tco.geometry import invert, pixel_grid, project, rays, transform, unproject
 from tco.options import ConsensusConfig
 from tco.schedule import most_overlapping
@@ -23,6 +23,16 @@ VIEWS = 7
 @pytest.fixture(scope="module")
 def scene() -> Wall:
     return wall(VIEWS)
+
+
+def robust_mean(values: Tensor, weights: Tensor, width: float) -> Tensor:
+    """Around the weighted median."""
+    return consensus.robust_mean(values, weights, width, weighted_median(values, weights))
+
+
+def standard_error(values: Tensor, weights: Tensor) -> Tensor:
+    """Around the weighted median."""
+    return consensus.standard_error(values, weights, weighted_median(values, weights))
 
 
 def said(scene: Wall, depth: Tensor, confidence: float = 5.0) -> Prediction:
