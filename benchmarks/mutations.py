@@ -157,7 +157,7 @@ MUTATIONS = [
         ("OF_MEDIAN * count.sqrt()", "count.sqrt()"),
         ("(count - 0.8)", "count"),
         ("upper=True", "upper=False"),
-        ("(values - weighted_median(values, weights)).abs()", "values.abs()"),
+        ("off = (values - middle).abs()", "off = values.abs()"),
         ("weights.sum(0) ** 2 / (weights**2).sum(0)", "(weights > 0).sum(0) / torch.ones(()).double()"),
         ("spread.where(known[view], error[view])", "spread"),
         ("config.consensus_views)", "100)"),
