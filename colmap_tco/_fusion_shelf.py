@@ -156,7 +156,7 @@ class Shelf:
         shape = maps.depth.shape
         packed = np.empty((*shape, kernels.CHANNELS), np.float32)
         camera = kernels.camera(map_intrinsics(view.camera, shape))
-        arrays, bounds = _arrays(maps), _bounds(self._config, view)
+        arrays, bounds = _arrays(maps), _bounds(self._config, view, maps)
 
         def pack(part: slice) -> NDArray[np.int64]:
             counts = np.zeros(kernels.NOT_FINITE + 1, np.int64)
@@ -215,17 +215,18 @@ def _arrays(maps: FusionMaps) -> kernels.Maps:
     )
 
 
-def _bounds(config: FusionConfig, view: FusionView) -> kernels.Bounds:
+def _bounds(config: FusionConfig, view: FusionView, maps: FusionMaps) -> kernels.Bounds:
+    least = 1.0 if maps.confidence is None else config.min_confidence
     bend = config.max_depth_bend if config.max_depth_bend > 0 else math.inf
     far = config.max_depth_ratio * view.reach if config.max_depth_ratio > 0 else math.inf
     sure = float(np.float32(view.sure))  # as the maps have it
-    return config.min_confidence, bend, math.cos(math.radians(config.max_view_angle)), far, sure
+    return least, bend, math.cos(math.radians(config.max_view_angle)), far, sure
 
 
 def _check_maps(view: FusionView, maps: FusionMaps, config: FusionConfig) -> None:
     shape = maps.depth.shape
-    if maps.confidence is None and (config.min_confidence > 1 or config.sigma_at_one > 0):
-        raise ValueError(f"{view.name}: min_confidence and sigma_at_one need a confidence, it has none")
+    if maps.confidence is None and config.sigma_at_one > 0:
+        raise ValueError(f"{view.name}: sigma_at_one needs a confidence, it has none")
     if maps.normal.shape != (*shape, 3):
         raise ValueError(f"{view.name}: normals {maps.normal.shape} do not fit the depths {shape}")
     for name, array in (("confidence", maps.confidence), ("mask", maps.mask), ("error", maps.error)):

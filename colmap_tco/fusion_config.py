@@ -43,7 +43,10 @@ class FusionConfig:
     )
     num_threads: int = knob(-1, "Threads of all stages; -1 is one a core.")
     min_confidence: float = knob(
-        1.0, "Pixels of a lower confidence are dropped. Confidence is at least 1, so that 1 keeps all."
+        1.1,
+        "Pixels of a lower confidence are dropped: sky and guesses. Of the network in the package it is "
+        "1 + 0.02 / expected relative error, so that 1.1 stands for 20 %; 1 keeps all. Maps that have no "
+        "confidence are all kept.",
     )
     max_depth_bend: float = knob(
         0.05,

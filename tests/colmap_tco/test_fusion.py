@@ -542,7 +542,7 @@ def test_confident_views_weigh_more() -> None:
     def maps_of(i: int, maps: FusionMaps) -> FusionMaps:
         sure = i == 3
         depth = maps.depth if sure else maps.depth * np.float32(1.004)
-        return replace(maps, depth=depth, confidence=np.full_like(maps.depth, 100.0 if sure else 1.0))
+        return replace(maps, depth=depth, confidence=np.full_like(maps.depth, 200.0 if sure else 2.0))
 
     views = [with_maps(v, lambda m, i=i: maps_of(i, m)) for i, v in enumerate(Scene().views())]  # type: ignore[misc]
     cloud, _ = fuse(views, CONFIG)
@@ -583,10 +583,23 @@ def test_refuses_maps_that_do_not_fit(change: Callable[[FusionMaps], FusionMaps]
         fuse(views, CONFIG)
 
 
-@pytest.mark.parametrize("name", ["min_confidence", "sigma_at_one"])
-def test_confidence_that_is_asked_for_must_be_there(name: str) -> None:
-    with pytest.raises(ValueError, match=r"0\.jpg: .* need a confidence"):
-        fuse(Scene().views(), replace(CONFIG, **{name: 1.5}))
+def test_confidence_that_is_asked_for_must_be_there() -> None:
+    with pytest.raises(ValueError, match=r"0\.jpg: .* needs a confidence"):
+        fuse(Scene().views(), replace(CONFIG, sigma_at_one=1.5))
+
+
+def test_guesses_are_dropped_by_default_and_maps_without_confidence_are_not() -> None:
+    """An error of 30 % is expected of the left half of each map, of 10 % of the right one."""
+
+    def half(maps: FusionMaps) -> FusionMaps:
+        left = np.arange(maps.depth.shape[1]) < maps.depth.shape[1] // 2
+        both = np.where(left, 1 + 0.02 / 0.3, 1 + 0.02 / 0.1).astype(np.float32)
+        return replace(maps, confidence=np.broadcast_to(both, maps.depth.shape).copy())
+
+    views = Scene().views()
+    assert fuse(views, FusionConfig())[1].pixels["min_confidence"] == 0
+    _, report = fuse([with_maps(view, half) for view in views], FusionConfig())
+    assert report.pixels["min_confidence"] == 7 * SIZE[0] * SIZE[1] // 2
 
 
 @pytest.mark.parametrize("name", ["min_num_pixels", "max_depth_error", "cache_size"])
