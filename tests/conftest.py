@@ -289,7 +289,7 @@ def fresh_room(room: Room, tmp_path: Path) -> Room:
     return Room(root, room.names, room.sample)
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def same_logging() -> Iterator[None]:
     """Undo the logging that the command line sets up, for tests that call it inside this process."""
     root = logging.getLogger()

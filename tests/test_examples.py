@@ -271,9 +271,7 @@ def test_command_lines_say_what_the_examples_found(
     assert metres is not None and float(metres[1]) == pytest.approx(METRES, rel=0.005)
 
 
-def test_the_demo_runs_twice_in_one_folder(
-    tmp_path: Path, same_logging: None, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_demo_runs_twice_in_one_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Pictures and model are kept, the rest is made anew; pictures of another scene are not mixed in."""
     words = ["--folder", str(tmp_path), "--views", "4", "--max_image_size", "96", "--steps", "0"]
     assert demo.main(words) == 0

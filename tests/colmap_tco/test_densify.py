@@ -714,7 +714,7 @@ def test_a_folder_of_bare_images_is_mapped_first(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def command(same_logging: None) -> Callable[..., int]:
+def command() -> Callable[..., int]:
     """The command line inside this process."""
     return lambda *words: main([*words])
 

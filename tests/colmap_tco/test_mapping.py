@@ -178,9 +178,7 @@ def test_the_bar_follows_a_database_that_is_being_written(
 
 
 @pytest.mark.parametrize(("verbosity", "log_json", "level"), [(0, False, 2), (1, False, 0), (1, True, 2)])
-def test_colmaps_own_log_is_shown_where_asked_for(
-    same_logging: None, verbosity: int, log_json: bool, level: int
-) -> None:
+def test_colmaps_own_log_is_shown_where_asked_for(verbosity: int, log_json: bool, level: int) -> None:
     configure_logging(verbosity, log_json)
     log = _pycolmap.load().logging
     before = log.minloglevel

@@ -92,7 +92,7 @@ def test_all_images_get_poses_from_a_network_alone(
     K = room.sample.K[0] * np.array([[112 / 320], [84 / 240], [1]])
     camera = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
     config = PosesConfig(
-        depths=depths, output_path=tmp_path / "out", steps=1,
+        depths=depths, output_path=tmp_path / "out", steps=0,
         rough=RoughConfig(camera_params=camera if known else ()),
         poses=PoseConfig(sizes=(48,), iterations=(2,), neighbours=3),
         network=NetworkConfig(backbone="vggt", weights=str(weights), device="cpu"),

@@ -27,7 +27,7 @@ def test_the_range_of_planes_comes_from_the_percentiles_of_the_points() -> None:
     outlier[0] = 1e-3
     xy = torch.zeros(101, 2)
     lo, hi = inverse_range([points(xy, depth), points(xy, outlier)], torch.zeros(()))
-    torch.testing.assert_close(lo, torch.full((2,), 1 / (2 * 4.96)))
+    torch.testing.assert_close(lo, torch.full((2,), 1 / (20 * 4.96)))
     torch.testing.assert_close(hi[0], torch.tensor(1 / (0.7 * 1.04)))
     torch.testing.assert_close(hi[1], hi[0])
     with pytest.raises(ValueError, match="view 1 has no sparse point"):

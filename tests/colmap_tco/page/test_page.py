@@ -128,7 +128,8 @@ def test_errors_at_points_are_those_of_the_report(paths: DensePaths, embedded: d
         for shift in ((-1e-3, -1e-3), (-1e-3, 1e-3), (1e-3, -1e-3), (1e-3, 1e-3)):
             x, y = np.floor(xy + shift).astype(int).T
             choices.append(depth[y.clip(0, depth.shape[0] - 1), x.clip(0, depth.shape[1] - 1)] / z - 1)
-        assert np.abs(np.stack(choices) - error).min(0).max() < 1e-6
+        off = np.abs(np.stack(choices) - error) / (1 + np.abs(error))  # single precision
+        assert off.min(0).max() < 1e-6
         size = np.abs(np.stack(choices))
         for chosen, reported in ((held, "error_at_held_out"), (~held, "error_at_points")):
             # torch's median, which the run has used, is the lower of the two in the middle.
@@ -364,7 +365,7 @@ def test_the_ground_has_the_colour_of_how_many_views_saw_it(
     columns = np.nonzero(canvas[..., 3])[1]
     few, many = (np.where((canvas[..., :3] == bgr).all(2) & (canvas[..., 3] > 0))[1] for bgr in VIRIDIS_ENDS)
     assert len(few) + len(many) > 0.9 * len(columns)
-    assert few.max() <= many.min()
+    assert few.max() <= many.min() + 8  # a square of the ground has one colour
     page.close()
 
 
