@@ -314,7 +314,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(line, flush=True)
         lines.append(line)
     if options.output is not None:
-        options.output.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        text = "\n".join(["# Speed of the published networks", "", *lines])
+        options.output.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
