@@ -49,9 +49,6 @@ class ObjectiveConfig:
         0.0, "Share s of the structural term: (1 − s) · L1 + s · (1 − SSIM) / 2. 0.85 is common with SSIM."
     )
     ssim_window: int = knob(7, "Side of the SSIM window in pixels, odd.")
-    constant_weights: bool = knob(
-        False, "No gradient through alpha in the weights, so that surfels cannot fade to lower the loss."
-    )
     renderer: str = knob(
         "surface",
         "Engine that renders the surfels. surface puts the lowest loss at the true depth; cpu and gsplat "
@@ -114,8 +111,7 @@ def weights(rendered: Rendered, depth: Tensor, valid: Tensor | None, config: Obj
     counted = rendered.depth.detach() <= limit
     if valid is not None:
         counted = counted & valid
-    alpha = rendered.alpha.detach() if config.constant_weights else rendered.alpha
-    weight = alpha * counted
+    weight = rendered.alpha * counted
     if not bool((weight > 0).any()):
         raise NothingVisibleError("no valid pixel of the target views sees the surfels of the source view")
     return weight

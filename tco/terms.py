@@ -78,6 +78,8 @@ class Terms:
         self.held = priors.held
         if self.held is not None and self.given is not None:
             raise ValueError("cameras are given, so that there are none of the network's own to be held")
+        if self.held is not None and len(views) < 2 and self.held.rotation + self.held.translation > 0:
+            logger.warning("%s: one view has no relative pose to be held", views.names[0])
         if config.depth_weight > 0:
             self._check_depth()
         if self.given is not None and config.sparse_weight > 0 and priors.sparse is None:

@@ -190,16 +190,6 @@ def test_derivatives_match_finite_differences(config: ObjectiveConfig) -> None:
     assert torch.autograd.gradcheck(lambda c, d, a: depths(Rendered(c, d, a), cut, config), leaves)
 
 
-def test_constant_weights_have_no_derivative() -> None:
-    rendered, targets = scene()
-    alpha = rendered.alpha.clone().requires_grad_(True)
-    given = Rendered(rendered.color, rendered.depth, alpha)
-    config = replace(PLAIN, constant_weights=True)
-    assert not colors(given, targets, config).requires_grad
-    colors(given, targets, PLAIN).backward()
-    assert alpha.grad is not None and bool(alpha.grad.any())
-
-
 @pytest.mark.parametrize("slope", [0.0, 0.3, -0.3])
 def test_the_photometric_term_is_lowest_at_the_true_depth(slope: float) -> None:
     """A textured plane z = 2 + slope · x, seen from the side: of all scales of the depth, 1 is the best."""
