@@ -147,8 +147,7 @@ class _Run:
         a = config.ablation
         self.free = FreePixels(context.depth, a.free_depth, a.free_surfels)
         self.sources = Sources(a.source_order, self.terms.overlap, generator, views.helpers)
-        patience = config.stop_after * config.sources
-        self.stagnation = Stagnation(len(views), patience) if patience else None
+        self.stagnation: Stagnation | None = None
         self.history: list[dict[str, float]] = []
         self.rolled_back: list[int] = []
         self.watched: Sequence[SparseDepth] = ()
@@ -181,8 +180,16 @@ class _Run:
         if not self.parameters:
             raise ValueError("there is nothing to optimise: no adapters, no camera_rate, no free pixels")
         self.optimiser = Adam([group for group in groups if group[0]], BETAS)
+        patience = c.stop_after * c.sources
+        self.stagnation = Stagnation(self._measured(), patience) if patience else None
         self.active: tuple[str, ...] = ()
         self.best, self.best_loss = self._state(), math.inf
+
+    def _measured(self) -> list[int]:
+        """Views whose error can tell when to stop: sources that have points of which some are unseen."""
+        if self.watched:
+            return [view for view in self.views.wanted if len(self.watched[view])]
+        return [view for view in self.views.wanted if len(self.terms.sparse[view]) > FEWEST_POINTS]
 
     def _state(self) -> tuple[list[Tensor], Prediction]:
         """The parameters and the context as they are now."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
@@ -73,19 +74,19 @@ class Stagnation:
     once every view was measured.
     """
 
-    def __init__(self, views: int, patience: int, gain: float = 0.005) -> None:
-        """Stop after ``patience`` measurements without a fall of the average by ``gain``.
+    def __init__(self, views: Iterable[int], patience: int, gain: float = 0.005) -> None:
+        """Stop after ``patience`` measurements of these views without a fall of the average by ``gain``.
 
         The gain is in the unit of the error; for penalties of residuals in standard deviations, less than
         0.005 is nothing to wait for.
         """
-        self.latest = [math.nan] * views
+        self.latest = dict.fromkeys(views, math.nan)
         self.patience, self.gain, self.best, self.waited = patience, gain, math.inf, 0
 
     def add(self, view: int, error: float) -> bool:
         """Record the error of a view; True if it is time to stop."""
         self.latest[view] = error
-        average = sum(self.latest) / len(self.latest)
+        average = sum(self.latest.values()) / len(self.latest)
         if math.isnan(average):
             return False
         if average + self.gain < self.best:

@@ -309,6 +309,9 @@ def test_the_steps_end_when_held_out_points_improve_no_more(scene: Scene) -> Non
     outcome = optimize(Small(), views, priors, still, watched=priors.sparse)
     assert len(outcome.history) == len(views) + 3
     assert all("hidden" not in step for step in outcome.history)
+    some = (priors.sparse[0][torch.zeros(len(priors.sparse[0]), dtype=torch.bool)], *priors.sparse[1:])
+    blind = optimize(Small(), views, priors, still, watched=some)  # a view that has none does not hold it up
+    assert len(blind.history) < 2 * len(views) + 6
 
 
 def test_every_view_is_a_source_once_before_any_is_again(scene: Scene) -> None:

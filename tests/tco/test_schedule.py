@@ -72,7 +72,7 @@ def test_targets_share_points_with_the_source_are_different_and_follow_the_odds(
 
 
 def test_stagnation_waits_for_all_views_and_then_for_its_patience() -> None:
-    watch = Stagnation(2, patience=3)
+    watch = Stagnation(range(2), patience=3)
     assert not any(watch.add(0, error) for error in (5.0, 5.0, 5.0, 5.0, 5.0))  # the other view is not known
     falling = [watch.add(i % 2, 4.0 - 0.3 * i) for i in range(1, 9)]
     assert not any(falling)
@@ -82,14 +82,14 @@ def test_stagnation_waits_for_all_views_and_then_for_its_patience() -> None:
 
 def test_every_gain_starts_the_wait_anew() -> None:
     """Two measurements without gain between any two with: never the three that it waits for."""
-    watch = Stagnation(1, patience=3)
+    watch = Stagnation(range(1), patience=3)
     errors = [5.0, 5.0, 5.0, 4.0, 4.0, 4.0, 3.0, 3.0, 3.0, 2.0]
     assert not any(watch.add(0, error) for error in errors)
 
 
 def test_a_hard_view_after_an_easy_one_is_no_stagnation() -> None:
     """Errors of 1 and 9 that both fall: the later of two successive errors is often the larger one."""
-    watch = Stagnation(2, patience=2)
+    watch = Stagnation(range(2), patience=2)
     assert not any(watch.add(i % 2, (1.0, 9.0)[i % 2] * 0.95**i) for i in range(20))
 
 
