@@ -1,8 +1,8 @@
 """Speed and memory of the published networks with random weights: forward, and a step of optimisation.
 
     python -m benchmarks.backbone [--networks vggt pi3] [--views 2 4 8 16 32] [--size 392 518]
-        [--device cpu] [--dtype float32] [--threads 2] [--repeat 1] [--recompute] [--cpu-time] [--small]
-        [--output FILE]
+        [--device cpu] [--dtype float32] [--threads 2] [--repeat 1] [--last 6] [--recompute] [--cpu-time]
+        [--small] [--output FILE]
 
 ``forward`` encodes all views and decodes depth, confidence and cameras of all. ``step`` is a step of
 ``tco.optimize`` on a made-up scene: with low-rank adapters, decode the cameras of all views and the depth of
@@ -11,7 +11,8 @@ Operations are the network's alone, counted from the shapes on the meta device, 
 adds, so the share of a step counts all else as time lost. The share is of the rate at which the device
 multiplies matrices of the same dtype, measured before and after each row, so that other programs slow both.
 ``--cpu-time`` divides by the CPU time of the process instead of the wall clock, for one thread on a machine
-that is not idle. A row that does not fit the memory says so; ``--recompute`` makes steps fit that do not.
+that is not idle. With ``--last`` a step adapts so many last blocks alone, and those before are run once,
+ahead of all steps. A row that does not fit the memory says so; ``--recompute`` makes steps fit that do not.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from tco.align import KnownCameras
 from tco.backbones.dinov2 import ViTConfig
 from tco.backbones.pi3 import Pi3, Pi3Config, Pi3Network
 from tco.backbones.vggt import VGGT, VGGTConfig, VGGTNetwork
-from tco.lora import LoRAConfig, adapted
+from tco.lora import LoRAConfig, adapted, changed
 from tco.optimize import Outcome, optimize
 from tco.options import PolishConfig, TCOConfig
 from tco.types import Priors, Views
@@ -114,10 +115,17 @@ def forward(backbone: Any, views: Views) -> None:
         backbone.decode(backbone.encode(views, Priors()))
 
 
-def operations(name: str, small: bool, count: int, size: tuple[int, int], kind: str) -> int:
+def targets(name: str, small: bool, last: int) -> tuple[str, ...]:
+    """Patterns of the layers that a step adapts: of all blocks, or of so many last ones."""
+    depth = NETWORKS[name][2 + small].depth
+    return tuple(f"{i}.*" for i in range(max(0, depth - last), depth)) if last else LoRAConfig().targets
+
+
+def operations(name: str, small: bool, count: int, size: tuple[int, int], kind: str, last: int = 0) -> int:
     """Floating-point operations of the network in a row; a multiplication and an addition are two.
 
-    Those of a step are the decoding of one view with adapters, and its way back.
+    Those of a step are the decoding of one view with adapters on all blocks, or so many last ones, and its
+    way back.
     """
     with torch.device("meta"):
         backbone, network, *sizes = NETWORKS[name]
@@ -130,7 +138,9 @@ def operations(name: str, small: bool, count: int, size: tuple[int, int], kind: 
     with torch.no_grad():
         encoded = made.encode(views, Priors())
         context = made.decode(encoded)
-    with adapted(made.decoder(), LoRAConfig()), FlopCounterMode(display=False) as counter:
+    config = LoRAConfig(targets=targets(name, small, last))
+    encoded = made.ahead(encoded, changed(made.decoder(), config))
+    with adapted(made.decoder(), config), FlopCounterMode(display=False) as counter:
         p = made.decode(encoded, [0], context)
         (p.depth.mean() + p.confidence.mean() + p.cameras.world_from_cam.sum()).backward()
     return counter.get_total_flops()
@@ -173,11 +183,9 @@ def timed(backbone: Any, views: Views, priors: Priors, config: TCOConfig, clock:
     return Timed(tuple(ends), clock() - start - ends[-1], outcome)
 
 
-def steps_of(steps: int) -> TCOConfig:
+def steps_of(steps: int, targets: tuple[str, ...] = LoRAConfig().targets) -> TCOConfig:
     """Steps on the network alone: those on the depths cost the same whatever the network."""
-    return TCOConfig(
-        steps=steps, lora_targets=("qkv", "proj", "fc1", "fc2"), polish=PolishConfig(polish_looks=0)
-    )
+    return TCOConfig(steps=steps, lora_targets=targets, polish=PolishConfig(polish_looks=0))
 
 
 def seconds(backbone: Any, kind: str, count: int, options: argparse.Namespace, clock: Clock) -> float:
@@ -188,7 +196,8 @@ def seconds(backbone: Any, kind: str, count: int, options: argparse.Namespace, c
     size = tuple(options.size)
     if kind == "step":
         views, priors = (part.to(clock.device) for part in scene(count, size))
-        ends = timed(KnownCameras(backbone), views, priors, steps_of(1 + options.repeat), clock).ends
+        config = steps_of(1 + options.repeat, targets(backbone.name, options.small, options.last))
+        ends = timed(KnownCameras(backbone), views, priors, config, clock).ends
         return min(later - earlier for earlier, later in pairwise(ends))
     torch.manual_seed(0)
     views, times = views_of(count, size, clock.device), []
@@ -262,7 +271,7 @@ def figures(backbone: Any, name: str, kind: str, count: int, options: argparse.N
     with peak(clock.device) as memory:
         best = seconds(backbone, kind, count, options, clock)
     rate = (before + matrix_rate(clock, dtype, length)) / 2
-    flop = operations(name, options.small, count, tuple(options.size), kind)
+    flop = operations(name, options.small, count, tuple(options.size), kind, options.last)
     share = f"{100 * flop / best / rate:.0f} %"
     speeds = [f"{flop / 1e12:.2f}", f"{flop / best / 1e9:.0f}", f"{rate / 1e9:.0f}", share]
     return [f"{best:.2f}", *speeds, f"{memory[0]:.1f}"]
@@ -273,6 +282,7 @@ def table(options: argparse.Namespace) -> Iterator[str]:
     height, width = options.size
     device = torch.device(options.device)
     again = ", activations computed again" if options.recompute else ""
+    again += f", adapters on the last {options.last} blocks" if options.last else ""
     yield f"{width}×{height}, {options.dtype}, {device}, {options.threads} threads{again}"
     yield ""
     yield f"| {' | '.join(COLUMNS)} |"
@@ -302,6 +312,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--repeat", type=int, default=1)
     parser.add_argument("--cpu-time", action="store_true", help="CPU time of this process, for one thread")
+    parser.add_argument("--last", type=int, default=0, help="blocks that a step adapts; 0: all")
     parser.add_argument("--small", action="store_true", help="networks of a few layers, to try the script")
     parser.add_argument("--recompute", action="store_true", help="recompute all activations in the step")
     parser.add_argument("--output", type=Path, help="Markdown file to write as well")

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from tco.backbones.base import Backbone
+from tco.backbones.base import Backbone, RunsAhead
 from tco.config import knob
 from tco.penalties import held, inverse_depth_error, rotation_angle
 from tco.types import Cameras, HeldCameras, Prediction, Priors, SparseDepth, Views
@@ -213,6 +213,12 @@ class KnownCameras(nn.Module):
         """Other points to tell the scale of some views."""
         kept = tuple(points.get(view, old) for view, old in enumerate(encoded.points))
         return replace(encoded, inner=self.network.with_points(encoded.inner, points), points=kept)
+
+    def ahead(self, encoded: Aligned, changed: Collection[str]) -> Aligned:
+        """The same, with what the network can compute ahead."""
+        if not isinstance(self.network, RunsAhead):
+            return encoded
+        return replace(encoded, inner=self.network.ahead(encoded.inner, changed))
 
     def decode(
         self, encoded: Aligned, views: Sequence[int] | None = None, context: Prediction | None = None

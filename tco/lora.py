@@ -88,6 +88,16 @@ def select(module: nn.Module, patterns: Iterable[str]) -> dict[str, Layer]:
     return {name: layer for name, layer in layers.items() if name in chosen}
 
 
+def changed(module: nn.Module, config: LoRAConfig) -> list[str]:
+    """Dotted names of what :func:`adapted` changes in ``module``: layers, and modules trained in full.
+
+    Raises:
+        ValueError: a pattern that fits nothing, or a layer that cannot be adapted.
+    """
+    whole = [n for n, _ in module.named_modules() if n and any(matches(n, p) for p in config.unfrozen)]
+    return [*select(module, config.targets), *whole]
+
+
 @contextmanager
 def adapted(
     module: nn.Module, config: LoRAConfig | None = None, generator: torch.Generator | None = None

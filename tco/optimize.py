@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 from tco.adam import Adam
-from tco.backbones.base import Backbone
+from tco.backbones.base import Backbone, RunsAhead
 from tco.context import detached, due, merged
 from tco.corrections import CameraCorrections
 from tco.free import FreePixels
-from tco.lora import LoRAConfig, adapted, fits
+from tco.lora import LoRAConfig, adapted, changed, fits
 from tco.options import TCOConfig
 from tco.penalties import sparse_depth
 from tco.polish import polish, too_uncertain
@@ -154,10 +154,13 @@ class _Run:
         self.stopped = False
 
     def adapters(self) -> AbstractContextManager[list[torch.nn.Parameter]]:
-        """Low-rank adapters on the decoder, drawn from this run's generator."""
-        c = self.config
+        """Low-rank adapters, drawn from this run's generator; what comes before them is computed, once."""
+        c, decoder = self.config, self.backbone.decoder()
         lora = LoRAConfig(c.lora_rank, c.lora_alpha, self._targets(), c.ablation.unfrozen)
-        return adapted(self.backbone.decoder(), lora, self.generator)
+        names = changed(decoder, lora)
+        if names and isinstance(self.backbone, RunsAhead):
+            self.encoded = self.backbone.ahead(self.encoded, names)
+        return adapted(decoder, lora, self.generator)
 
     def _targets(self) -> tuple[str, ...]:
         """Patterns of the layers to adapt: as given; of the default those that fit any."""

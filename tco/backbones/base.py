@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from torch import nn
@@ -46,4 +46,21 @@ class Backbone(Protocol):
 
     def decoder(self) -> nn.Module:
         """The module whose layers test-time adapters may change."""
+        ...
+
+
+@runtime_checkable
+class RunsAhead(Protocol):
+    """A backbone that computes what comes before the first changed layer of its decoder only once."""
+
+    def ahead(self, encoded: Any, changed: Collection[str]) -> Any:
+        """The same features, with what no changed layer has a part in computed, without gradients.
+
+        ``decode`` gives the same as before to the last bit, and goes on from there. The result is right for
+        as long as no other layers change.
+
+        Args:
+            encoded: of :meth:`Backbone.encode`.
+            changed: dotted names of the layers of :meth:`Backbone.decoder` that change, not empty.
+        """
         ...

@@ -21,8 +21,8 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ from torch.utils.checkpoint import checkpoint
 
 from tco.backbones.checkpoints import load_network
 from tco.backbones.dinov2 import PATCH, normalized, patch_grid
+from tco.backbones.prefix import Passed, first_block
 from tco.backbones.transformer import compute_dtype, computing, store_products
 from tco.geometry import invert, matrix_from_quat, rigid
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
@@ -152,10 +153,12 @@ class Tokens:
     Attributes:
         tokens: (V, 1 + rows · columns, C); the first of each view says what is known of its camera.
         grid: rows and columns of patches.
+        passed: the tokens behind the first of the other blocks, where those are computed once.
     """
 
     tokens: Tensor
     grid: tuple[int, int]
+    passed: Passed | None = None
 
     def __len__(self) -> int:
         return int(self.tokens.shape[0])
@@ -233,6 +236,19 @@ class DA3(nn.Module):
         """The same features: this network takes no points."""
         return encoded
 
+    @torch.no_grad()
+    def ahead(self, encoded: Tokens, changed: Collection[str]) -> Tokens:
+        """The same, with the blocks before the first that changes behind it, an even number of them."""
+        c = self.network.config
+        depth = min(first_block(changed, c.start), c.depth - 1) // 2 * 2
+        x, kept = encoded.tokens, dict[int, Tensor]()
+        with computing(encoded.tokens.device, self.dtype):
+            for i, one, after in self._passing(encoded, Passed(c.start, x), depth):
+                x = after
+                if i in c.layers:
+                    kept[i] = self._read(one, x)
+        return replace(encoded, passed=Passed(depth, x, kept))
+
     def decode(
         self, encoded: Tokens, views: Sequence[int] | None = None, context: Prediction | None = None
     ) -> Prediction:
@@ -248,18 +264,30 @@ class DA3(nn.Module):
 
     def _features(self, encoded: Tokens, views: Sequence[int]) -> tuple[list[Tensor], Tensor]:
         """Patch tokens (V', P, 2 C) of the chosen views at four depths, camera tokens (V, 2 C) of all."""
-        c, vit, chosen = self.network.config, self.transformer, list(views)
-        x = encoded.tokens.unsqueeze(0)
-        place, same = vit._prepare_rope(1, len(encoded), *encoded.size, x.device)
-        one, dense = x, []
-        for i in range(c.start, c.depth):
+        c, chosen = self.network.config, list(views)
+        passed = encoded.passed or Passed(c.start, encoded.tokens)
+        dense = [passed.kept[i][chosen] for i in c.layers if i in passed.kept]
+        one = x = passed.tokens
+        for i, one, x in self._passing(encoded, passed, c.depth):
+            if i in c.layers:
+                dense.append(self._read(one[chosen], x[chosen]))
+        return dense, torch.cat([one[:, 0], x[:, 0]], -1)
+
+    def _read(self, one: Tensor, x: Tensor) -> Tensor:
+        """Patch tokens (V, P, 2 C) as the heads read them, from all tokens (V, N, C) of two blocks."""
+        return torch.cat([one[:, 1:], self.transformer.norm(x[:, 1:])], -1)
+
+    def _passing(self, encoded: Tokens, passed: Passed, depth: int) -> Iterator[tuple[int, Tensor, Tensor]]:
+        """Go on to ``depth`` blocks: of each its index, the last tokens of single views, and its own."""
+        x = passed.tokens.unsqueeze(0)
+        place, same = self.transformer._prepare_rope(1, len(encoded), *encoded.size, x.device)
+        one = x
+        for i in range(passed.depth, depth):
             if i % 2:
                 x = self._block(i, x, "global", same)
             else:
                 one = x = self._block(i, x, "local", place)
-            if i in c.layers:
-                dense.append(torch.cat([one[0, chosen, 1:], vit.norm(x[0, chosen, 1:])], -1))
-        return dense, torch.cat([one[0, :, 0], x[0, :, 0]], -1)
+            yield i, one[0], x[0]
 
     def _block(self, i: int, x: Tensor, sees: str, place: Tensor) -> Tensor:
         """Tokens (1, V, N, C) after a block that sees one view (``local``) or all (``global``)."""

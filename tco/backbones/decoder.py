@@ -161,10 +161,16 @@ def _resized(x: Tensor, like: Tensor) -> Tensor:
 
 
 def soft_argmax(scores: Tensor, radius: int = 2) -> tuple[Tensor, Tensor]:
-    """Expected plane index around the best one and the probability of that neighbourhood, both (B, h, w)."""
+    """Expected plane index around the likeliest place and the probability of that neighbourhood, (B, h, w).
+
+    The likeliest place is the middle of the three neighbouring planes that are most probable together. A
+    surface lies between planes, which share its probability, while all that is farther than the sweep is on
+    its farthest plane alone: by single planes, whatever is in doubt would be put there.
+    """
     p = scores.softmax(1)
     index = torch.arange(scores.shape[1], device=scores.device, dtype=scores.dtype).view(1, -1, 1, 1)
-    near = (index - scores.detach().argmax(1, keepdim=True)).abs() <= radius
+    together = F.avg_pool3d(p.detach().unsqueeze(1), (3, 1, 1), 1, (1, 0, 0)).squeeze(1)
+    near = (index - together.argmax(1, keepdim=True)).abs() <= radius
     p = p * near
     mass = p.sum(1)
     return (p * index).sum(1) / mass, mass

@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from tco.backbones.prefix import Passed
 from tco.backbones.transformer import Block
 from tco.types import Views
 
@@ -58,12 +59,14 @@ class Patches:
         grid: rows and columns of patches.
         valid: (V, H, W) bool, of the canvas.
         patch: side of a patch in pixels.
+        passed: the tokens behind the first blocks of the decoder, where those are computed once.
     """
 
     tokens: Tensor
     grid: tuple[int, int]
     valid: Tensor
     patch: int = PATCH
+    passed: Passed | None = None
 
     def __len__(self) -> int:
         return int(self.tokens.shape[0])

@@ -10,8 +10,8 @@ intrinsics: they are a centred pinhole camera whose focal length is recovered fr
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from tco.backbones.checkpoints import load_network
 from tco.backbones.dinov2 import COLOR_MEAN, COLOR_STD, PATCH, DINOv2, Patches, ViTConfig, patch_grid
 from tco.backbones.pi3_heads import PixelHead, PoseHead, ViewDecoder, recovered_focal
+from tco.backbones.prefix import Passed, first_block
 from tco.backbones.transformer import (
     Block,
     compute_dtype,
@@ -83,20 +84,31 @@ class Pi3Network(nn.Module):
         self.conf_decoder, self.conf_head = reader(c.hidden), PixelHead(c.hidden, 1)
         self.camera_decoder, self.camera_head = reader(c.pose), PoseHead(c.pose)
 
-    def decoded(self, patches: Tensor, grid: tuple[int, int], recompute: range = range(0)) -> Tensor:
-        """Tokens (V, registers + P, 2 C) of the last two blocks, from patch tokens (V, P, C)."""
-        c, views = self.config, len(patches)
-        x = torch.cat([self.register_token[0].expand(views, -1, -1), patches], 1)
+    def begun(self, patches: Tensor) -> Passed:
+        """Register and patch tokens, before the first block, from patch tokens (V, P, C)."""
+        registers = self.register_token[0].expand(len(patches), -1, -1)
+        return Passed(0, torch.cat([registers, patches], 1))
+
+    def decoded(self, passed: Passed, grid: tuple[int, int], recompute: range = range(0)) -> Tensor:
+        """Tokens (V, registers + P, 2 C) of the last two blocks."""
+        last = self.config.depth - 1
+        before = self.passing(passed, grid, last, recompute)
+        return torch.cat([before.tokens, self.passing(before, grid, last + 1, recompute).tokens], -1)
+
+    def passing(
+        self, passed: Passed, grid: tuple[int, int], depth: int, recompute: range = range(0)
+    ) -> Passed:
+        """Go on to ``depth`` blocks."""
+        c, x = self.config, passed.tokens
         own = rotary(grid, c.registers, c.channels // c.heads, x.device)
-        common = own.repeated(views)
-        before = x
-        for i, block in enumerate(self.decoder):
-            before = x
+        common = own.repeated(len(x))
+        for i in range(passed.depth, depth):
+            block = self.decoder[i]
             if i % 2 == 0:
                 x = run_block(block, x, own, i in recompute)
             else:
                 x = run_block(block, x.flatten(0, 1).unsqueeze(0), common, i in recompute).view_as(x)
-        return torch.cat([before, x], -1)
+        return Passed(depth, x)
 
 
 def products(network: Pi3Network) -> list[nn.Module]:
@@ -149,6 +161,14 @@ class Pi3(nn.Module):
         """The same features: this network takes no points."""
         return encoded
 
+    @torch.no_grad()
+    def ahead(self, encoded: Patches, changed: Collection[str]) -> Patches:
+        """The same, with the blocks before the first that changes behind it; the last is always ahead."""
+        n, depth = self.network, min(first_block(changed), self.network.config.depth - 1)
+        with computing(encoded.tokens.device, self.dtype):
+            passed = n.passing(n.begun(encoded.tokens), encoded.grid, depth)
+        return replace(encoded, passed=passed)
+
     def decode(
         self, encoded: Patches, views: Sequence[int] | None = None, context: Prediction | None = None
     ) -> Prediction:
@@ -176,7 +196,8 @@ class Pi3(nn.Module):
     def tokens(self, encoded: Patches) -> Tensor:
         """Tokens (V, registers + P, 2 C) that all heads read."""
         with computing(encoded.tokens.device, self.dtype):
-            return self.network.decoded(encoded.tokens, encoded.grid, self.recompute)
+            passed = encoded.passed or self.network.begun(encoded.tokens)
+            return self.network.decoded(passed, encoded.grid, self.recompute)
 
     def poses(self, tokens: Tensor, encoded: Patches) -> Tensor:
         """world_from_cam (V, 4, 4) of all views, in the network's own world."""

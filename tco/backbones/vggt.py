@@ -11,8 +11,8 @@ and that is not used here.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from tco.backbones.checkpoints import load_network
 from tco.backbones.dinov2 import PATCH, DINOv2, Patches, ViTConfig, normalized, patch_grid
+from tco.backbones.prefix import Passed, first_block
 from tco.backbones.transformer import (
     Block,
     Rotary,
@@ -112,6 +113,7 @@ class Aggregator(nn.Module):
         chosen: Sequence[int],
         recompute: range = range(0),
         scenes: int = 1,
+        passed: Passed | None = None,
     ) -> Features:
         """Aggregate patch tokens.
 
@@ -122,21 +124,40 @@ class Aggregator(nn.Module):
             recompute: depths whose activations are computed again in the backward pass.
             scenes: as many scenes of equally many views, one after the other in V; views attend to those
                 of their own scene alone.
+            passed: what :meth:`ahead` made of these tokens.
         """
         c, views = self.config, len(patches) // scenes
-        x = torch.cat([self.special(views).repeat(scenes, 1, 1), patches], 1)
+        passed = passed or self._begun(patches, scenes)
+        x = frame = passed.tokens
         own = rotary(grid, 1 + c.registers, c.channels // c.heads, x.device)
         common = own.repeated(views)
         index = torch.tensor(list(chosen), device=x.device)
-        both: dict[int, Tensor] = {}
-        frame = x
-        for i in range(c.depth):
+        both = {i: kept[index] for i, kept in passed.kept.items()}
+        for i in range(passed.depth, c.depth):
             frame = run_block(self.frame_blocks[i], x, own, i in recompute)
             x = self._over_all(i, frame.unflatten(0, (scenes, views)), common, i in recompute)
             if i in c.layers or i == c.depth - 1:
                 both[i] = torch.cat([frame[index], x[index]], -1)
         dense = tuple(both[i][:, 1 + c.registers :] for i in c.layers)
         return Features(torch.cat([frame[:, 0], x[:, 0]], -1), dense, both[c.depth - 1])
+
+    def ahead(self, patches: Tensor, grid: tuple[int, int], depth: int) -> Passed:
+        """Pass the first depths, fewer than all, with the patch tokens (V, P, C) of one scene."""
+        c, start = self.config, self._begun(patches, 1)
+        x, kept = start.tokens, {}
+        own = rotary(grid, 1 + c.registers, c.channels // c.heads, x.device)
+        common = own.repeated(len(patches))
+        for i in range(depth):
+            frame = self.frame_blocks[i](x, own)
+            x = self._over_all(i, frame.unsqueeze(0), common, False)
+            if i in c.layers:
+                kept[i] = torch.cat([frame, x], -1)
+        return Passed(depth, x, kept)
+
+    def _begun(self, patches: Tensor, scenes: int) -> Passed:
+        """Camera, register and patch tokens, before the first block."""
+        special = self.special(len(patches) // scenes).repeat(scenes, 1, 1)
+        return Passed(0, torch.cat([special, patches], 1))
 
     def _over_all(self, i: int, x: Tensor, common: Rotary, recompute: bool) -> Tensor:
         every = run_block(self.global_blocks[i], x.flatten(1, 2), common, recompute)
@@ -209,10 +230,20 @@ class VGGT(nn.Module):
         """The same features: this network takes no points."""
         return encoded
 
+    @torch.no_grad()
+    def ahead(self, encoded: Patches, changed: Collection[str]) -> Patches:
+        """The same, with the depths before the first that changes behind it; the last is always ahead."""
+        depth = min(first_block(changed), self.network.config.depth - 1)
+        with computing(encoded.tokens.device, self.dtype):
+            passed = self.network.aggregator.ahead(encoded.tokens, encoded.grid, depth)
+        return replace(encoded, passed=passed)
+
     def features(self, encoded: Patches, views: Sequence[int]) -> Features:
         """What the heads read, for the chosen views."""
         with computing(encoded.tokens.device, self.dtype):
-            return self.network.aggregator(encoded.tokens, encoded.grid, views, self.recompute)
+            return self.network.aggregator(
+                encoded.tokens, encoded.grid, views, self.recompute, passed=encoded.passed
+            )
 
     def decode(
         self, encoded: Patches, views: Sequence[int] | None = None, context: Prediction | None = None

@@ -42,6 +42,16 @@ def test_going_back_through_frozen_layers_costs_as_much_as_going_forward() -> No
     assert forward < operations("pi3", True, views, size, "step") < 2.5 * forward
 
 
+def test_the_blocks_before_the_adapted_ones_cost_a_step_nothing() -> None:
+    """Half of the blocks twice, there and back, instead of all; the readers of π³ are run in any case."""
+    views, size = 3, (56, 84)
+    c, tokens = NETWORKS["pi3"][3], 4 * 6 + NETWORKS["pi3"][3].registers
+    half = blocks(c.depth // 4, views * tokens, tokens, c.channels)
+    half += blocks(c.depth // 4, views * tokens, views * tokens, c.channels)
+    whole, part = (operations("pi3", True, views, size, "step", last) for last in (0, c.depth // 2))
+    assert whole - part > 1.8 * half
+
+
 def test_it_prints_a_table(capsys: pytest.CaptureFixture[str]) -> None:
     main(["--small", "--device", "cpu", "--networks", "pi3", "--views", "1", "2", "--size", "28", "42"])
     lines = capsys.readouterr().out.splitlines()
