@@ -21,13 +21,10 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from tco.backbones.sweep import Encoded, Stage, Sweep
-from tco.backbones.sweeping import FAR
+from tco.backbones.sweeping import BACKGROUND
 from tco.types import Priors, Views
 from training.dataset import load
 from training.loop import Loop, LoopConfig, arguments, launch
-
-FLOOR = FAR / 2
-"""Inverse depths below so many times the sweep's smallest are background: the farthest points' depth × 2."""
 
 Drawn = tuple[tuple[Views, Priors, Tensor], np.random.Generator]
 
@@ -76,10 +73,10 @@ def coarse_loss(stage: Stage, encoded: Encoded, truth: Tensor) -> Tensor:
 def with_sky(depth: Tensor, encoded: Encoded) -> tuple[Tensor, Tensor]:
     """Depth (V, H, W) with the sky, where it is 0, and what is as far put at the end of the sweep.
 
-    The second (V, 1, 1) is the inverse depth ``FLOOR``, below which is the background.
+    The second (V, 1, 1) is the inverse depth ``BACKGROUND``, below which is the background.
     """
     end = 1 / encoded.lo.view(-1, 1, 1)
-    return torch.where(depth > 0, depth, end).minimum(end), FLOOR * encoded.lo.view(-1, 1, 1)
+    return torch.where(depth > 0, depth, end).minimum(end), BACKGROUND * encoded.lo.view(-1, 1, 1)
 
 
 def fine_loss(stage: Stage, truth: Tensor, floor: Tensor) -> Tensor:

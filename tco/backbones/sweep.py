@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from tco.backbones.decoder import Decoder, SweepConfig, convex_upsample, soft_argmax
 from tco.backbones.layers import FeatureNet
-from tco.backbones.sweeping import Hints, interpolate_points, inverse_range, relative_cameras
+from tco.backbones.sweeping import BACKGROUND, Hints, interpolate_points, inverse_range, relative_cameras
 from tco.backbones.transformer import compute_dtype, computing
 from tco.backbones.warp import agree, correlate
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
@@ -229,7 +229,8 @@ class Sweep(nn.Module):
         scores = torch.cat(parts)
         v = torch.as_tensor(list(views), device=encoded.lo.device)
         lo, step = encoded.lo[v].view(-1, 1, 1), encoded.step[v].view(-1, 1, 1)
-        index, mass = soft_argmax(scores)
+        planes = lo + step * torch.arange(scores.shape[1], device=lo.device, dtype=lo.dtype).view(1, -1, 1)
+        index, mass = soft_argmax(scores, (planes < BACKGROUND * lo).squeeze(-1))
         inverse = lo + step * index
         error = (step / inverse * (0.3 + 3 * (1 - mass))).log()
         return Stage(inverse, error, scores)

@@ -36,6 +36,9 @@ FAR = 20.0
 """Where the sweep ends, in units of the depth of the farthest points. To cameras as far apart as it takes to
 triangulate those, what is there hardly differs from the sky."""
 
+BACKGROUND = FAR / 2
+"""Inverse depths below so many times the smallest are background: twice as far as the farthest points."""
+
 
 def inverse_range(sparse: Sequence[SparseDepth], like: Tensor) -> tuple[Tensor, Tensor]:
     """Smallest and largest inverse depth (V,) of a sweep: the points' 1st percentile × 0.7 to 99th × ``FAR``.

@@ -327,6 +327,29 @@ def test_soft_argmax_of_known_distributions() -> None:
     torch.testing.assert_close(mass[0, 0], expected[:, 1])
 
 
+def test_what_is_in_doubt_is_no_background() -> None:
+    """The first two of eight planes are background: they need more than half of all probability."""
+    rows = {
+        (0.2, 0.2, 0, 0, 0.1, 0.2, 0.2, 0.1): (5.5, 0.6),  # mode by a single plane, or three: background
+        (0.3, 0.3, 0, 0, 0, 0.4, 0, 0): (0.5, 0.6),  # what is not background is left out of the mean
+        (0, 0.3, 0.4, 0.3, 0, 0, 0, 0): (2 + 0.3 / 0.7, 0.7),  # and the other way round
+    }
+    p = torch.tensor(list(rows), dtype=torch.float64).T.reshape(1, 8, 1, len(rows))
+    background = torch.arange(8).view(1, -1) < 2
+    index, mass = soft_argmax(p.clamp_min(1e-30).log() - 2.0, background)
+    expected = torch.tensor(list(rows.values()), dtype=torch.float64)
+    torch.testing.assert_close(index[0, 0], expected[:, 0])
+    torch.testing.assert_close(mass[0, 0], expected[:, 1])
+
+
+def test_neighbouring_planes_count_together() -> None:
+    """A surface between planes against a plane that alone is more probable than each of them."""
+    p = torch.tensor([0.3, 0, 0, 0, 0.2, 0.25, 0.25, 0], dtype=torch.float64).view(1, 8, 1, 1)
+    index, mass = soft_argmax(p.clamp_min(1e-30).log())
+    assert float(index) == pytest.approx((4 * 0.2 + 5 * 0.25 + 6 * 0.25) / 0.7)
+    assert float(mass) == pytest.approx(0.7)
+
+
 def test_soft_argmax_is_differentiable_but_for_the_choice_of_the_best() -> None:
     scores = torch.randn(1, 7, 2, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     with torch.enable_grad():

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from tco.backbones.decoder import SweepConfig
 from tco.backbones.sweep import Encoded, Stage, Sweep
+from tco.backbones.sweeping import BACKGROUND
 from tco.backbones.weights import load_sweep
 from training import train
 from training.dataset import load, write
 from training.train import (
-    FLOOR,
     TrainConfig,
     Trainer,
     coarse_loss,
@@ -145,7 +145,7 @@ def test_the_sky_is_at_the_end_of_the_sweep() -> None:
     _, encoded = planes_stage(torch.zeros(1, 6, 1, 3), torch.zeros(1, 1, 3))
     depth, floor = with_sky(torch.tensor([[[2.5, 0.0, 9.0]]]), encoded)
     torch.testing.assert_close(depth, torch.tensor([[[2.5, 5.0, 5.0]]]))
-    assert float(floor) == pytest.approx(0.2 * FLOOR)
+    assert float(floor) == pytest.approx(0.2 * BACKGROUND)
 
 
 def test_in_the_background_errors_are_relative_to_where_it_begins() -> None:
