@@ -160,13 +160,18 @@ def _resized(x: Tensor, like: Tensor) -> Tensor:
     return F.interpolate(x, size=like.shape[2:], mode=mode, align_corners=False)
 
 
+DOUBT = 1 / 3
+"""Probability from which on there is nothing but background. On plain walls at the rim of pictures it was seen
+at 0.2 to 0.37, on real sky and where nothing is from 0.4 up (``benchmarks/rendered.py``)."""
+
+
 def soft_argmax(scores: Tensor, background: Tensor | None = None, radius: int = 2) -> tuple[Tensor, Tensor]:
     """Expected plane index around the likeliest place and the probability of that neighbourhood, (B, h, w).
 
     The likeliest place is the middle of the three neighbouring planes that are most probable together: a
     surface lies between planes, which share its probability. The planes of the background share nothing, all
     that is far is on them, so that whatever is in doubt would be put there: they are asked only where they
-    are more probable than all others together, and then alone.
+    are more probable than ``DOUBT`` together, and then alone.
 
     Args:
         scores: (B, D, h, w) of the planes, logarithms of probabilities up to a constant.
@@ -177,7 +182,7 @@ def soft_argmax(scores: Tensor, background: Tensor | None = None, radius: int = 
     index = torch.arange(scores.shape[1], device=scores.device, dtype=scores.dtype).view(1, -1, 1, 1)
     if background is not None:
         behind = background[..., None, None]
-        p = p * (behind == ((p * behind).sum(1, keepdim=True) > 0.5))
+        p = p * (behind == ((p * behind).sum(1, keepdim=True) > DOUBT))
     together = F.avg_pool3d(p.detach().unsqueeze(1), (3, 1, 1), 1, (1, 0, 0)).squeeze(1)
     near = (index - together.argmax(1, keepdim=True)).abs() <= radius
     p = p * near
