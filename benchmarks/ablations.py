@@ -41,8 +41,11 @@ def variants(decoder: nn.Module, plain: TCOConfig) -> Iterator[tuple[str, TCOCon
     polish = PolishConfig()
     yield "depths polished, network as it is", replace(plain, steps=1, rate=0.0, polish=polish)
     yield "adapted, then polished (what densify does)", replace(plain, polish=polish)
-    rendered = replace(polish, polish_renders=True)
-    yield "depths polished by rendering", replace(plain, steps=1, rate=0.0, polish=rendered)
+    whole = replace(plain, polish=polish)
+    yield "the same without colours", replace(whole, photometric_weight=0.0)
+    yield "the same with L1 alone", replace(whole, structure=0.0)
+    yield "the same without exposure", replace(whole, exposure=False)
+    yield "the same without occlusion", replace(whole, occlusion_tolerance=1e9)
     fine = replace(polish, polish_levels=(1,))
     yield "depths polished pixel by pixel", replace(plain, steps=1, rate=0.0, polish=fine)
     for rank in (1, 16):
@@ -61,7 +64,7 @@ def variants(decoder: nn.Module, plain: TCOConfig) -> Iterator[tuple[str, TCOCon
     yield "opaque surfels", ablation(confident_opacity=False)
     for factor in (0.05, 1.0, 2.0):
         yield f"radius factor {factor}", ablation(radius_factor=factor)
-    for name in ("photometric", "consistency", "sparse"):
+    for name in ("photometric", "sparse"):
         yield f"without the {name} term", replace(plain, **{f"{name}_weight": 0.0})  # type: ignore[arg-type]
     yield "L1 alone", replace(plain, structure=0.0)
     yield "no exposure", replace(plain, exposure=False)

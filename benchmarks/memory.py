@@ -319,7 +319,7 @@ def run(backbone: Any, tracks: Any, views: list[Any], device: Any, steps: int) -
     from colmap_tco.published import NETWORKS
     from tco.options import ConsensusConfig, PolishConfig, TCOConfig
 
-    plain = TCOConfig(steps=steps, consistency_start=0.0, polish=PolishConfig(polish_looks=POLISH_LOOKS))
+    plain = TCOConfig(steps=steps, polish=PolishConfig(polish_looks=POLISH_LOOKS))
     toy = backbone.name not in NETWORKS
     tco = replace(plain, lora_targets=("plane",)) if toy else suited(plain, NETWORKS[backbone.name])
     settings = (PriorConfig(), tco, ConsensusConfig(), 0)

@@ -135,7 +135,6 @@ MUTATIONS = [
         ("invert(cameras.world_from_cam[chosen]) @", "cameras.world_from_cam[chosen] @"),
         ("detach() > 1 + config.occlusion", "detach() < 1 + config.occlusion"),
         ("weight = opacity * (warped.valid", "weight = 1.0 * (warped.valid"),
-        ("trust[warped.inside]", "trust[warped.inside] ** 0"),
     ),
     *_of(
         "tco/consensus.py",
@@ -246,7 +245,6 @@ MUTATIONS = [
     *_of(
         "tco/terms.py",
         "terms toy optimize",
-        ("number >= c.consistency_start * c.steps", "number > c.consistency_start * c.steps + 1"),
         ("if weight > 0}", "}"),
         ("return angle + 2 * centres", "return angle - 2 * centres"),
         ("mask = (self.depth > 0)", "mask = (self.depth >= 0)"),

@@ -87,18 +87,11 @@ class Densified:
 
     def doubts(self) -> list[str]:
         """What keeps the result from being complete and good, a sentence each."""
-        images, held = self.report["images"], self.report["held_out"]
-        left, told = images["skipped"] + images["failed"], []
+        images, told = self.report["images"], []
+        left = images["skipped"] + images["failed"]
         if left:
             told.append(f"{left} images were left out; report.json says why of each")
-        if not held["plausible"]:
-            told.append(
-                f"the depths contradict COLMAP's points (median error {100 * held['error']:.0f} %, where one "
-                f"depth for each view would have {100 * held['error_of_one_depth']:.0f} %): do not use them"
-            )
-        if self.report["no_points"]:
-            told.append(self.report["no_points"])
-        return told
+        return [*told, *(self.report[name] for name in ("doubt", "no_points") if self.report[name])]
 
     def summary(self) -> str:
         """What the user wants to know at the end."""

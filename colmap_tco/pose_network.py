@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-SETTINGS = TCOConfig(photometric_weight=0.0, geometric_weight=1.0, depth_weight=1.0, consistency_weight=0.0)
+SETTINGS = TCOConfig(photometric_weight=0.0, geometric_weight=1.0, depth_weight=1.0)
 """The paper's objective where depths are the prior: compatibility of depths, and the depths themselves."""
 
 

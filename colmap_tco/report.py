@@ -22,11 +22,15 @@ def contents(result: Result, used: Sequence[View], left: Mapping[str, Mapping[st
         used: the views that the cloud is made of.
         left: state (skipped, failed, unregistered) → name → why an image is in it.
     """
+    held, chunks = held_out(result), [dict(chunk) for chunk in result.chunks]
+    for chunk in chunks:
+        del chunk["loss"]
     return {
         "views": view_table(result, used, left),
         "images": {"used": len(used), **{state: len(reasons) for state, reasons in left.items()}},
-        "chunks": [{k: v for k, v in chunk.items() if k != "loss"} for chunk in result.chunks],
-        "held_out": held_out(result),
+        "chunks": chunks,
+        "held_out": held,
+        "doubt": doubt(held, chunks),
         "loss": [chunk["loss"] for chunk in result.chunks],
         "versions": versions(),
     }
@@ -66,6 +70,37 @@ def held_out(result: Result) -> dict[str, Any]:
 
 SMALL_ERROR = 0.02
 """Relative depth error that is good in any scene."""
+
+STRANGE = {"rotation_degrees": 10.0, "centre": 0.75}
+"""Disagreement of a network's own cameras with COLMAP's from which on it has not understood the views.
+Centres that know nothing of them are off by about 1, in units of their mean distance from the middle."""
+
+
+def doubt(held: Mapping[str, Any], chunks: Sequence[Mapping[str, Any]]) -> str:
+    """Why the depths should not be used, or nothing.
+
+    They contradict COLMAP's points. Or they agree with them because they were moved there, and the network
+    that they come from, which finds cameras itself, found others.
+
+    Args:
+        held: of :func:`held_out`.
+        chunks: each with the ``agreement`` of the network's cameras with COLMAP's, if it predicts any.
+    """
+    if not held["plausible"]:
+        return (
+            f"the depths contradict COLMAP's points (median error {100 * held['error']:.0f} %, where one "
+            f"depth for each view would have {100 * held['error_of_one_depth']:.0f} %): do not use them"
+        )
+    found = [chunk["agreement"] for chunk in chunks if chunk["agreement"]]
+    strange = [one for one in found if any(one[part] > bound for part, bound in STRANGE.items())]
+    if not strange:
+        return ""
+    worst = max(strange, key=lambda one: one["centre"])
+    turn, shift = f"{worst['rotation_degrees']:.1f}°", f"{100 * worst['centre']:.0f} %"
+    return (
+        f"the network's own cameras contradict COLMAP's (rotations by {turn}, centres by {shift} of their "
+        "spread): between COLMAP's points its depths mean nothing, do not use them"
+    )
 
 
 def versions() -> dict[str, str]:

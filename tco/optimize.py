@@ -69,8 +69,8 @@ def optimize(
     """Adapt ``backbone`` to the views and predict all of them; the network is left as it was.
 
     Per step, one source view is decoded, becomes surfels, and is rendered into the views that overlap
-    it most; the difference in colour, the disagreement in depth, the error at triangulated points and
-    the departure from the camera priors are lowered by Adam on low-rank adapters of the decoder. Then the
+    it most; the difference in colour, the error at triangulated points and the departure from the camera
+    priors are lowered by Adam on low-rank adapters of the decoder. Then the
     depths themselves are refined by the same objective (:mod:`tco.polish`).
 
     Without cameras among the priors, a network that predicts them is adapted to find them: by dense depths
@@ -185,7 +185,7 @@ class _Run:
         self.optimiser = Adam([group for group in groups if group[0]], BETAS)
         patience = c.stop_after * c.sources
         self.stagnation = Stagnation(self._measured(), patience) if patience else None
-        self.active: tuple[str, ...] = ()
+        self.weights = self.terms.weights(self.corrections is not None)
         self.best, self.best_loss = self._state(), math.inf
 
     def _measured(self) -> list[int]:
@@ -206,12 +206,8 @@ class _Run:
 
     def step(self, number: int) -> dict[str, float]:
         """One step; returns its terms and their weighted sum."""
-        weights = self.terms.weights(number, self.corrections is not None)
-        if tuple(weights) != self.active:
-            # Sums of other terms cannot be compared: the best loss so far is forgotten.
-            self.active, self.best_loss = tuple(weights), math.inf
-        sources = self.sources.draw(self.config.sources)
-        terms = self._evaluate(number, sources, weights)
+        weights = self.weights
+        terms = self._evaluate(number, self.sources.draw(self.config.sources))
         seen = {name: terms.pop(name) for name in ("hidden", "held_out") if name in terms}
         loss = torch.stack(
             [weights[name] * value for name, value in terms.items()] or [torch.zeros(())]
@@ -253,8 +249,9 @@ class _Run:
         for p, kept in zip(self.parameters, values, strict=True):
             p.copy_(kept)
 
-    def _evaluate(self, number: int, sources: list[int], weights: Mapping[str, float]) -> dict[str, Tensor]:
+    def _evaluate(self, number: int, sources: list[int]) -> dict[str, Tensor]:
         """Named terms of a step, means over its sources; and errors that only tell, see :meth:`_watch`."""
+        weights = self.weights
         shown = {source: self._hide(source) for source in sources}
         count, overlap = self.config.targets, self.terms.overlap
         targets = {source: draw_targets(overlap, source, count, self.generator) for source in sources}

@@ -88,16 +88,6 @@ class PolishConfig:
         "weight of the mean difference between the logarithms of the factors of neighbouring pixels, less "
         "across edges of the picture; raise it if surfaces get rough",
     )
-    polish_consistency: float = knob(
-        0.0,
-        "consistency_weight of these steps. Depths that are tied to each other move to the colours together "
-        "or not at all: wrong ones that agree stay",
-    )
-    polish_renders: bool = knob(
-        False,
-        "compare colours by rendering surfels, as the steps on the network do, and not by warping; three "
-        "times dearer and no better",
-    )
     polish_levels: tuple[int, ...] = knob(
         (2, 8), "sides of the cells that share a factor, in pixels of the network's image; 1 follows noise"
     )
@@ -105,9 +95,7 @@ class PolishConfig:
     def __post_init__(self) -> None:
         if self.polish_looks < 0 or self.polish_sources < 1 or not self.polish_levels:
             raise ValueError("polish_looks must not be negative, and there must be a source and a level")
-        if self.polish_smoothness < 0 or self.polish_consistency < 0:
-            raise ValueError("polish_smoothness and polish_consistency are weights, not negative")
-        check_range(self, "polish_rate polish_uncertainty", 0)
+        check_range(self, "polish_rate polish_uncertainty polish_smoothness", 0)
         check_range(self, "polish_levels", 1)
 
     def steps(self, views: int) -> int:
@@ -176,9 +164,6 @@ class TCOConfig:
         0.0, "weight of dense depths among the priors, after one scale and shift for all that is predicted"
     )
     sparse_weight: float = knob(0.01, "weight of the triangulated points, in inverse depth")
-    consistency_weight: float = knob(
-        1.0, "weight of the agreement with the depths of the other views, in the steps on the network"
-    )
     camera_weight: float = knob(
         3e-4,
         "weight of the pose and focal priors, each in units of its own uncertainty. With b the colour error "
@@ -215,14 +200,6 @@ class TCOConfig:
     occlusion_tolerance: float = knob(
         0.02, "a rendered surface further behind the target's own by this share of its depth does not count"
     )
-    consistency_start: float = knob(
-        0.5,
-        "share of the steps after which the depths of the views are tied to each other: earlier, wrong "
-        "depths that agree would hold each other in place against the colours",
-    )
-    consistency_tolerance: float = knob(
-        0.02, "relative depth difference above which two views' disagreement is weighed less and less"
-    )
     exposure: bool = knob(
         True, "match brightness and contrast of each pair of views before comparing colours"
     )
@@ -241,10 +218,10 @@ class TCOConfig:
         if not 0 <= self.point_dropout < 1:
             raise ValueError(f"point_dropout is a share below 1, not {self.point_dropout}")
         check_range(self, "lora_rank", 1)
-        check_range(self, "lora_alpha clip consistency_tolerance", POSITIVE)
-        check_range(self, "structure consistency_start", 0, 1)
+        check_range(self, "lora_alpha clip", POSITIVE)
+        check_range(self, "structure", 0, 1)
         check_range(self, "photometric_weight geometric_weight depth_weight sparse_weight", 0)
-        check_range(self, "consistency_weight camera_weight rate camera_rate", 0)
+        check_range(self, "camera_weight rate camera_rate", 0)
         check_range(self, "reencode stop_after occlusion_tolerance", 0)
 
     def reference_schedule(self) -> TCOConfig:

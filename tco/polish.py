@@ -3,7 +3,7 @@
 Adapters change what the network makes of all views at once, and cannot put right what it makes of one place.
 Here the network's answer D is held fixed and multiplied by a field of factors, exp(δ), of which δ is a sum of
 bilinearly interpolated grids, zero at first. The objective is that of the adaptation: a source compared with
-the other views in colour, depths with depths, depths with points. Since each pixel has a depth of its own to
+the other views in colour, and its depths with points. Since each pixel has a depth of its own to
 move, colours are looked up where the pixel falls (:mod:`tco.warping`) and not rendered. No network is run, so
 that a step costs a fraction of one that adapts, and all views' depths are those of the moment.
 
@@ -234,11 +234,12 @@ def too_uncertain(priors: Priors, size: tuple[int, int], bound: float, consequen
 def _weights(terms: Terms, config: TCOConfig) -> dict[str, float]:
     """The adaptation's weights, with colours warped, and with what polishing weighs in its own way."""
     c = config.polish
-    weights = terms.weights(config.steps, False)
-    if not c.polish_renders and "photometric" in weights:
+    weights = terms.weights(False)
+    if "photometric" in weights:
         weights["warped"] = weights.pop("photometric")
-    own = {"consistency": c.polish_consistency, "smoothness": c.polish_smoothness}
-    return {name: weight for name, weight in (weights | own).items() if weight > 0}
+    if c.polish_smoothness > 0:
+        weights["smoothness"] = c.polish_smoothness
+    return weights
 
 
 EDGE = 0.1

@@ -15,7 +15,7 @@ from tco.objective import NothingVisibleError, ObjectiveConfig, geometric, photo
 from tco.options import TCOConfig
 from tco.surfels import Adjustment, SurfelConfig, Surfels, from_depth
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
-from tco.warping import disagreement, warp, warped_photometric
+from tco.warping import warp, warped_photometric
 
 logger = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ class ExtraTerm:
             )
 
 
-COMPATIBILITY = frozenset({"photometric", "geometric", "warped", "consistency"})
+COMPATIBILITY = frozenset({"photometric", "geometric", "warped"})
 """Terms that compare a view with others."""
 HELD = ("rotation", "translation", "focal")
 """Terms that hold the cameras that a network predicts."""
@@ -96,19 +96,13 @@ class Terms:
         if int(((self.depth > 0) & self.views.valid).sum()) < 2:
             raise ValueError("depth_weight is set and the dense depth is empty: all of it is 0 or masked out")
 
-    def weights(self, number: int, movable: bool) -> dict[str, float]:
-        """The weight of each term in a step; a term that is not here is not computed.
-
-        Args:
-            number: of the step.
-            movable: whether given cameras may move.
-        """
+    def weights(self, movable: bool) -> dict[str, float]:
+        """The weight of each term; one that is not here is not computed. ``movable``: given cameras are."""
         c = self.config
         cameras = 1.0 if c.ablation.plain_cameras else c.camera_weight
         every = {
             "photometric": c.photometric_weight,
             "geometric": c.geometric_weight,
-            "consistency": c.consistency_weight if number >= c.consistency_start * c.steps else 0.0,
             "sparse": c.sparse_weight,
             "depth": c.depth_weight,
             "cameras": cameras if movable else 0.0,
@@ -195,13 +189,10 @@ class Terms:
             terms["photometric"] = photometric(surfels, self.views.images[targets], cameras[targets], *there)
         if "geometric" in weights:
             terms["geometric"] = geometric(surfels, cameras[targets], *there)
-        if weights.keys() & {"warped", "consistency"}:
-            warped = warp(depth, self.views, cameras, source, targets, context)
         if "warped" in weights:
+            warped = warp(depth, self.views, cameras, source, targets, context)
             image, opacity = self.views.images[source], self._opacity(source, prediction)
             terms["warped"] = warped_photometric(warped, image, opacity, self.objective)
-        if "consistency" in weights:
-            terms["consistency"] = disagreement(warped, self.config.consistency_tolerance)
         return terms
 
     def _opacity(self, source: int, prediction: Prediction) -> Tensor:

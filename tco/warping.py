@@ -28,16 +28,12 @@ class Warped:
         depth: (T, H, W) camera z of the source's pixels in the targets, differentiable.
         ratio: (T, H, W) that z over the target's own depth; 1 where the two agree.
         color: (T, H, W, 3) RGB of the targets.
-        trust: (T, H, W) 1 − 1 / c of the targets' confidence c, constant.
-        inside: (T, H, W) bool, in front of the target and on its image.
-        valid: (T, H, W) bool, inside, and on valid pixels of the target alone.
+        valid: (T, H, W) bool, in front of the target, on its image, and on valid pixels of it alone.
     """
 
     depth: Tensor
     ratio: Tensor
     color: Tensor
-    trust: Tensor
-    inside: Tensor
     valid: Tensor
 
 
@@ -66,34 +62,16 @@ def warp(
     if not bool(inside.any()):
         raise NothingVisibleError(f"no pixel of view {source} falls into one of the views {chosen}")
     inverse = 1 / context.depth[chosen].clamp_min(1e-6)
-    constant = torch.stack([inverse, 1 - 1 / context.confidence[chosen], views.valid[chosen].to(depth)], 1)
+    constant = torch.stack([inverse, views.valid[chosen].to(depth)], 1)
     maps = torch.cat([constant.detach(), views.images[chosen]], 1)
-    found = sample(maps, xy).reshape(len(chosen), 6, h, w)
-    z, inside = z.reshape(-1, h, w), inside.reshape(-1, h, w)
+    found = sample(maps, xy).reshape(len(chosen), 5, h, w)
+    z = z.reshape(-1, h, w)
     return Warped(
         depth=z,
         ratio=z * found[:, 0],
-        color=found[:, 3:].permute(0, 2, 3, 1),
-        trust=found[:, 1].detach(),
-        inside=inside,
-        valid=inside & (found[:, 2].detach() > 1 - 1e-4),
+        color=found[:, 2:].permute(0, 2, 3, 1),
+        valid=inside.reshape(-1, h, w) & (found[:, 1].detach() > 1 - 1e-4),
     )
-
-
-def disagreement(warped: Warped, tolerance: float = 0.02) -> Tensor:
-    """Disagreement (scalar) of the source's depth with the depth that the targets have for the same points.
-
-    With the ratio r of the two, e = r − 1 costs τ log(1 + |e| / τ): L1 near zero, and indifferent to
-    occlusions, for which e is large. Mean over the projections that fall into a target, weighted by the
-    target's confidence c as an opacity, 1 − 1 / c: a guess is no evidence against another.
-
-    Args:
-        warped: the source in the targets.
-        tolerance: τ, relative.
-    """
-    error = (warped.ratio[warped.inside] - 1).abs()
-    weight = warped.trust[warped.inside]
-    return (weight * tolerance * torch.log1p(error / tolerance)).sum() / weight.sum().clamp_min(1e-6)
 
 
 def warped_photometric(

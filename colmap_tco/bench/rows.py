@@ -63,7 +63,7 @@ class Row:
 
 _FORWARD = (("steps", 0),)
 _ADAPT = (("polish", PolishConfig(polish_looks=0)),)
-_SILENT = (("photometric_weight", 0.0), ("geometric_weight", 0.0), ("consistency_weight", 0.0), *_ADAPT)
+_SILENT = (("photometric_weight", 0.0), ("geometric_weight", 0.0), *_ADAPT)
 _SURFELS = (("free_depth", True), ("free_surfels", True))
 
 

@@ -17,7 +17,7 @@ from tco.options import TCOConfig
 
 _COMMON: dict[str, Any] = {
     "lora_rank": 4, "lora_alpha": 16.0, "lora_targets": ("qkv", "proj", "fc1", "fc2"), "clip": 1.0,
-    "sparse_weight": 0.0, "consistency_weight": 0.0, "camera_rate": 0.0, "point_dropout": 0.0,
+    "sparse_weight": 0.0, "camera_rate": 0.0, "point_dropout": 0.0,
     "exposure": False, "structure": 0.0,
 }  # fmt: skip
 _POSES: dict[str, Any] = {"photometric_weight": 0.0, "geometric_weight": 1.0, "depth_weight": 1.0}

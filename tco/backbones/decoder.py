@@ -161,8 +161,8 @@ def _resized(x: Tensor, like: Tensor) -> Tensor:
 
 
 DOUBT = 1 / 3
-"""Probability from which on there is nothing but background. On plain walls at the rim of pictures it was seen
-at 0.2 to 0.37, on real sky and where nothing is from 0.4 up (``benchmarks/rendered.py``)."""
+"""Probability from which on there is nothing but background. Plain walls at the rim of pictures had 0.2 to
+0.37 of it, the sky and what is beyond the horizon of rendered scenes mostly 0.4 and more."""
 
 
 def soft_argmax(scores: Tensor, background: Tensor | None = None, radius: int = 2) -> tuple[Tensor, Tensor]:

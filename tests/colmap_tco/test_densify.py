@@ -202,7 +202,7 @@ def test_the_report_says_what_was_done(done: Done) -> None:
         assert figures["points"] > 50
     assert [len(chunk) for chunk in report["loss"]] == [config(steps=2).tco.all_steps(len(done.room.names))]
     terms = {name for step in report["loss"][0] for name in step}
-    assert {"photometric", "consistency", "sparse", "cameras", "loss"} <= terms
+    assert {"photometric", "sparse", "cameras", "loss"} <= terms
     held = report["held_out"]
     assert held["points"] == sum(v["points_held_out"] for v in report["views"].values()) > 50
     assert 0.7 < held["within_5_percent"] <= 1 and 0 < held["median_error"] < 0.02
@@ -737,7 +737,7 @@ def test_exit_code_0_and_the_summary(
         ("--holdout", "2"), ("--holdout", "1"), ("--holdout", "-0.1"), ("--polish_levels", "0"),
         ("--polish_levels", "2,-1"), ("--polish_rate", "-1"), ("--structure", "7"), ("--structure", "-0.1"),
         ("--clip", "-1"), ("--chunk_size", "-3"), ("--max_image_size", "-5"), ("--camera_weight", "-1"),
-        ("--consistency_start", "1.5"), ("--consistency_tolerance", "0"), ("--stop_after", "-1"),
+        ("--stop_after", "-1"),
         ("--radius_factor", "0"), ("--seed", "-1"), ("--overlap", "-1"), ("--num_similar", "0"),
         ("--kept_confidence", "0.5"), ("--reencode", "-1"),
     ],

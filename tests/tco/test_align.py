@@ -291,7 +291,7 @@ def test_optimisation_runs_through_and_lowers_the_penalties(
     wrapped = KnownCameras(network, CameraPenalties(focal=0.0))
     config = TCOConfig(
         steps=10, rate=2e-2, lora_targets=("qkv", "proj", "fc1", "fc2"), photometric_weight=0.0,
-        consistency_weight=0.0, sparse_weight=1e-6,
+        sparse_weight=1e-6,
     )  # fmt: skip
     outcome = optimize(wrapped, views, priors, config)
     sums = [step["rotation"] + 2 * step["translation"] for step in wrapped.history]

@@ -197,36 +197,26 @@ def test_certain_cameras_stay_where_they_are(scene: Scene) -> None:
 
 
 def test_every_step_is_reported_with_its_terms(scene: Scene) -> None:
-    """The loss is their weighted sum; the depths of the views are tied to each other in the second half."""
+    """The loss is their weighted sum."""
     views, priors, _ = scene
     seen: list[tuple[int, dict[str, float]]] = []
-    config = replace(
-        SMALL,
-        photometric_weight=3.0,
-        consistency_weight=50.0,
-        consistency_start=0.5,
-        sparse_weight=0.25,
-        camera_weight=2.0,
-    )
+    config = replace(SMALL, photometric_weight=3.0, sparse_weight=0.25, camera_weight=2.0)
     outcome = optimize(Small(), views, priors, config, report=lambda step, terms: seen.append((step, terms)))
     assert [step for step, _ in seen] == list(range(config.steps))
     assert [terms for _, terms in seen] == outcome.history
-    for step, terms in seen:
-        late = {"consistency"} if step >= config.steps / 2 else set()
-        assert terms.keys() == {"photometric", "sparse", "cameras", "loss"} | late
+    for _, terms in seen:
+        assert terms.keys() == {"photometric", "sparse", "cameras", "loss"}
         total = 3 * terms["photometric"] + 0.25 * terms["sparse"] + 2 * terms["cameras"]
-        assert terms["loss"] == pytest.approx(total + 50 * terms.get("consistency", 0), rel=1e-5)
+        assert terms["loss"] == pytest.approx(total, rel=1e-5)
     assert outcome.history[0]["cameras"] == 0
 
 
-@pytest.mark.parametrize("term", ["photometric", "consistency", "sparse"])
+@pytest.mark.parametrize("term", ["photometric", "sparse"])
 def test_a_weight_of_zero_switches_its_term_off(scene: Scene, term: str) -> None:
     views, priors, _ = scene
     off = replace(SMALL, **{f"{term}_weight": 0.0})
     history = optimize(Small(), views, priors, off).history
-    assert all(term not in terms for terms in history)
-    late = [len(terms) for terms in history[len(history) // 2 :]]
-    assert late == [4] * len(late)
+    assert all(term not in terms and len(terms) == 3 for terms in history)
 
 
 def test_cameras_that_may_not_move_have_no_term_and_need_no_uncertainty(scene: Scene) -> None:
@@ -243,9 +233,7 @@ def test_cameras_that_may_not_move_have_no_term_and_need_no_uncertainty(scene: S
 
 def test_with_every_term_off_nothing_changes(scene: Scene) -> None:
     views, priors, _ = scene
-    config = replace(
-        SMALL, photometric_weight=0, consistency_weight=0, sparse_weight=0, camera_weight=0, camera_rate=0
-    )
+    config = replace(SMALL, photometric_weight=0, sparse_weight=0, camera_weight=0, camera_rate=0)
     small = Small()
     outcome = optimize(small, views, priors, config)
     assert len(outcome.history) == SMALL.steps and small.decoded == []
@@ -272,7 +260,7 @@ def test_what_has_no_weight_is_not_computed(scene: Scene) -> None:
     views, priors, _ = scene
     unlucky = replace(views, images=views.images.clone())
     unlucky.images[:] = math.nan
-    only_points = replace(SMALL, photometric_weight=0, consistency_weight=0)
+    only_points = replace(SMALL, photometric_weight=0)
 
     class Blind(Small):
         """Interpolates the points, changed by a convolution of what is not the image."""
@@ -283,8 +271,6 @@ def test_what_has_no_weight_is_not_computed(scene: Scene) -> None:
     outcome = optimize(Blind(), unlucky, priors, only_points)
     assert outcome.rolled_back == ()
     assert optimize(Blind(), unlucky, priors, SMALL).rolled_back != ()
-    early = replace(SMALL, photometric_weight=0, consistency_start=1.0)
-    assert all("consistency" not in terms for terms in optimize(Small(), views, priors, early).history)
 
 
 @pytest.mark.parametrize("name", ["cameras", "overlap", "sparse"])
@@ -349,17 +335,15 @@ def test_a_view_with_hardly_any_points_keeps_them(scene: Scene) -> None:
 
 
 def test_views_that_share_no_point_are_never_compared(scene: Scene) -> None:
-    """A view without overlap has no targets: its steps have neither of the terms that need them."""
+    """A view without overlap has no targets: its steps do not have the term that needs them."""
     views, priors, _ = scene
     assert priors.overlap is not None
     overlap = priors.overlap.clone()
     overlap[2], overlap[:, 2] = 0, 0
     small = Small()
-    outcome = optimize(
-        small, views, replace(priors, overlap=overlap), replace(SMALL, steps=V, consistency_start=0)
-    )
+    outcome = optimize(small, views, replace(priors, overlap=overlap), replace(SMALL, steps=V))
     for (source,), terms in zip(small.decoded, outcome.history, strict=True):
-        assert ("photometric" in terms) == ("consistency" in terms) == (source != 2)
+        assert ("photometric" in terms) == (source != 2)
         assert "sparse" in terms
 
 
@@ -419,9 +403,9 @@ def test_the_best_state_is_the_one_of_the_lowest_loss(scene: Scene) -> None:
     views, priors, _ = scene
     outcome = optimize(Breaking((11,), math.nan), views, priors, replace(SMALL, steps=12))
     losses = [terms["loss"] for terms in outcome.history[:11]]
-    best = 6 + int(np.argmin(losses[6:]))  # consistency joins the loss at 6: what was before is another sum
-    assert outcome.rolled_back == (11,) and min(losses[:6]) < losses[best]
-    until = optimize(Small(), views, priors, replace(SMALL, steps=best, consistency_start=6 / best))
+    best = int(np.argmin(losses))
+    assert outcome.rolled_back == (11,) and 0 < best < 10
+    until = optimize(Small(), views, priors, replace(SMALL, steps=best))
     assert torch.equal(depth_of(outcome), depth_of(until))
 
 

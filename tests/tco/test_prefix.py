@@ -98,7 +98,7 @@ def test_optimisation_runs_the_first_blocks_once_more_whatever_the_number_of_ste
         counts = counted(backbone)
         depth = torch.rand(3, 42, 56, generator=torch.Generator().manual_seed(3)) + 1
         config = TCOConfig(
-            steps=4, lora_targets=targets, photometric_weight=0, consistency_weight=0, depth_weight=1,
+            steps=4, lora_targets=targets, photometric_weight=0, depth_weight=1,
             polish=PolishConfig(polish_looks=0),
         )  # fmt: skip
         optimize(backbone, some_views(), Priors(depth=depth), config)

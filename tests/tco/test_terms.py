@@ -82,7 +82,7 @@ def test_poses_are_found_from_depths(scene: Wall) -> None:
     network = Moving(scene, 0.7)
     assert isinstance(network, Backbone)
     config = TCOConfig(
-        steps=20, rate=1e-3, lora_targets=("twist",), consistency_weight=0, geometric_weight=1.0,
+        steps=20, rate=1e-3, lora_targets=("twist",), geometric_weight=1.0,
         depth_weight=1.0, occlusion_tolerance=0.2,
     )  # fmt: skip
     outcome = optimize(network, scene.views, Priors(depth=scene.depth), config)
@@ -177,7 +177,7 @@ def test_dense_depth_with_standard_deviations_is_compared_as_it_is(scene: Wall) 
 
 
 ALONE = TCOConfig(
-    steps=60, rate=0.02, lora_targets=("plane",), photometric_weight=0, consistency_weight=0, sparse_weight=0,
+    steps=60, rate=0.02, lora_targets=("plane",), photometric_weight=0, sparse_weight=0,
     camera_rate=0, polish=PolishConfig(polish_looks=0),
 )  # fmt: skip
 """Nothing but what the caller adds."""
@@ -219,10 +219,10 @@ def test_an_extra_term_may_be_silent_or_off_and_gives_the_cameras(scene: Wall) -
 
     own = ExtraTerm("two", 0.5, only_view_two)
     terms = Terms(scene.views, scene.priors, ALONE, [own, ExtraTerm("off", 0.0, only_view_two)])
-    assert terms.weights(0, False) == {"two": 0.5}
+    assert terms.weights(False) == {"two": 0.5}
     assert terms.given is not None
     now = Prediction(scene.depth, torch.full_like(scene.depth, 10.0), terms.given, (0, 1, 2, 3))
-    found = [terms.of_source(i, [], now, now, terms.given, terms.weights(0, False)) for i in range(4)]
+    found = [terms.of_source(i, [], now, now, terms.given, terms.weights(False)) for i in range(4)]
     assert [len(part) for part in found] == [0, 0, 1, 0]
     assert float(found[2]["two"]) == float(scene.depth[2].mean())
     assert seen == [(i, (48, 64), 4) for i in range(4)]
@@ -237,12 +237,12 @@ def test_names_and_weights_of_extra_terms_are_checked(scene: Wall) -> None:
 
 
 def test_only_what_has_a_weight_is_there(scene: Wall) -> None:
-    names = ("photometric", "geometric", "consistency", "sparse", "depth")
+    names = ("photometric", "geometric", "sparse", "depth")
     for name in names:
         assert of_source(scene, scene.depth, scene.depth, **{name: 0.3}).keys() == {name}
     every = of_source(scene, scene.depth, scene.depth, **dict.fromkeys(names, 1.0))
     assert every.keys() == set(names)
-    assert float(every["geometric"]) < 0.02 and float(every["consistency"]) < 1e-4
+    assert float(every["geometric"]) < 0.02
 
 
 def test_means_are_over_the_parts_that_have_a_term() -> None:
@@ -259,7 +259,7 @@ def test_a_networks_own_cameras_are_held_to_what_is_known(scene: Wall) -> None:
     held = Priors(held=HeldCameras(known, rotation=1.0, translation=2.0, focal=0.0))
     config = TCOConfig(
         steps=60, rate=0.01, lora_targets=("twist",), lora_rank=6, photometric_weight=0.0, sparse_weight=0.0,
-        consistency_weight=0.0, camera_rate=0.0,
+        camera_rate=0.0,
     )  # fmt: skip
 
     def turn(outcome_poses: Tensor) -> float:
@@ -297,7 +297,7 @@ def test_one_view_alone_has_no_relative_pose_to_hold(scene: Wall) -> None:
     true = Moving(scene, 0.0).true
     one = Views(scene.views.images[:1], scene.views.valid[:1], ("a",))
     terms = Terms(one, Priors(held=HeldCameras(true[:1])), TCOConfig())
-    assert terms.weights(0, False).keys() & {"rotation", "translation", "focal"} == {"focal"}
+    assert terms.weights(False).keys() & {"rotation", "translation", "focal"} == {"focal"}
 
 
 @pytest.mark.skipif(not PARITY.exists(), reason="the published numbers are not beside this checkout")

@@ -12,7 +12,7 @@ from torch import Tensor
 from tco.objective import NothingVisibleError, ObjectiveConfig
 from tco.toy import Wall, wall
 from tco.types import Cameras, Prediction, Views
-from tco.warping import Warped, disagreement, warp, warped_photometric
+from tco.warping import Warped, warp, warped_photometric
 
 F64 = torch.float64
 PLAIN = ObjectiveConfig()
@@ -25,12 +25,6 @@ def blank(like: Tensor, views: int) -> Views:
     return Views(shape, torch.ones(views, h, w, dtype=torch.bool), tuple(str(i) for i in range(views)))
 
 
-def consistency(
-    depth: Tensor, cameras: Cameras, source: int, targets: list[int], context: Prediction
-) -> Tensor:
-    return disagreement(warp(depth, blank(depth, len(cameras)), cameras, source, targets, context))
-
-
 def two_views_of_a_wall(distance: float) -> tuple[Tensor, Cameras, Prediction]:
     """Depth of a frontal wall in the first view, two cameras, and the second's exact prediction."""
     K = torch.tensor([[30.0, 0, 16], [0, 30.0, 12], [0, 0, 1]], dtype=F64).expand(2, 3, 3)
@@ -40,60 +34,40 @@ def two_views_of_a_wall(distance: float) -> tuple[Tensor, Cameras, Prediction]:
     return depth[0], Cameras(pose, K), Prediction(depth, 2 * torch.ones_like(depth), Cameras(pose, K), (0, 1))
 
 
-def test_consistency_of_agreeing_depths_is_zero_and_grows_with_the_error() -> None:
+def test_the_ratio_of_depths_is_one_where_they_agree() -> None:
+    """1 % more depth is 2.02 − 0.5 against 1.5."""
     depth, cameras, context = two_views_of_a_wall(2.0)
-    assert float(consistency(depth, cameras, 0, [1], context)) == pytest.approx(0, abs=1e-12)
-    # 1 % more depth is 2.02 − 0.5 against 1.5: e = 0.02 / 1.5.
-    expected = 0.02 * np.log1p(0.02 / 1.5 / 0.02)
-    assert float(consistency(1.01 * depth, cameras, 0, [1], context)) == pytest.approx(expected)
+    for factor, expected in ((1.0, 1.0), (1.01, 1.52 / 1.5)):
+        found = warp(factor * depth, blank(depth, 2), cameras, 0, [1], context)
+        assert int(found.valid.sum()) > 100
+        ratios = found.ratio[found.valid]
+        torch.testing.assert_close(ratios, torch.full_like(ratios, expected), rtol=1e-12, atol=0)
 
 
-def test_consistency_trusts_targets_by_their_confidence() -> None:
-    """Of two targets, one wrong and of confidence 1, only the other counts."""
-    depth, cameras, context = two_views_of_a_wall(2.0)
-    wrong = replace(
-        context,
-        depth=torch.cat([context.depth, 1.3 * context.depth[1:]]),
-        confidence=torch.cat([context.confidence, torch.ones_like(context.confidence[1:])]),
-    )
-    three = cameras[[0, 1, 1]]
-    assert float(consistency(depth, three, 0, [1, 2], wrong)) == pytest.approx(0, abs=1e-12)
-    trusted = replace(wrong, confidence=2 * torch.ones_like(wrong.confidence))
-    assert float(consistency(depth, three, 0, [1, 2], trusted)) > 0.01
-
-
-def test_consistency_is_indifferent_to_occlusions() -> None:
-    """A wall far behind what the target sees pulls at a hundredth of the force of a small error."""
-    depth, cameras, context = two_views_of_a_wall(2.0)
-    forces = []
-    for factor in (1.001, 5.0):
-        leaf = (factor * depth).requires_grad_(True)
-        consistency(leaf, cameras, 0, [1], context).backward()
-        assert leaf.grad is not None
-        forces.append(float(leaf.grad.abs().max()))
-    assert forces[1] < 0.02 * forces[0]
-
-
-def test_consistency_without_overlap_is_an_error() -> None:
+def test_no_overlap_is_an_error() -> None:
     depth, cameras, context = two_views_of_a_wall(2.0)
     pose = cameras.world_from_cam.clone()
     pose[1, :3, 3] = torch.tensor([100.0, 0, 0])
     with pytest.raises(NothingVisibleError, match="view 0"):
-        consistency(depth, Cameras(pose, cameras.K), 0, [1], context)
+        warp(depth, blank(depth, 2), Cameras(pose, cameras.K), 0, [1], context)
 
 
-def test_derivatives_of_consistency_match_finite_differences() -> None:
+def test_derivatives_by_cameras_match_finite_differences() -> None:
     depth, cameras, context = two_views_of_a_wall(2.0)
     bumpy = depth + 0.05 * torch.rand(24, 32, generator=torch.Generator().manual_seed(0), dtype=F64)
+    wavy = replace(context, depth=context.depth + 0.1 * torch.sin(torch.arange(32.0, dtype=F64) / 3))
     scale = torch.ones((), dtype=F64, requires_grad=True)
-    shift = torch.zeros(3, dtype=F64, requires_grad=True)
+    shift = torch.full((3,), 1e-3, dtype=F64, requires_grad=True)
 
     def f(scale: Tensor, shift: Tensor) -> Tensor:
-        pose = cameras.world_from_cam.clone()
-        pose[0, :3, 3] = shift
-        return consistency(scale * bumpy, Cameras(pose, cameras.K * scale), 0, [1], context)
+        pose = torch.cat([cameras.world_from_cam[:1, :3, 3] + shift, cameras.world_from_cam[1:, :3, 3]])
+        poses = torch.cat(
+            [cameras.world_from_cam[..., :3], torch.nn.functional.pad(pose, (0, 1), value=1)[..., None]], -1
+        )
+        found = warp(scale * bumpy, blank(depth, 2), Cameras(poses, cameras.K * scale), 0, [1], wavy)
+        return found.ratio[found.valid].square().mean()
 
-    assert torch.autograd.gradcheck(f, (scale, shift), eps=1e-8, atol=1e-5)
+    assert torch.autograd.gradcheck(f, (scale, shift), eps=1e-7, atol=1e-5)
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +93,6 @@ def test_what_a_target_shows_is_what_the_source_shows_where_the_depth_is_true(sc
     """Depths agree to rounding, colours to what interpolation leaves; not at wrong ones."""
     right, wrong = looked_up(scene), looked_up(scene, 1.05)
     assert float((right.ratio[right.valid] - 1).abs().max()) < 1e-4
-    torch.testing.assert_close(right.trust[right.valid], torch.full_like(right.trust[right.valid], 0.8))
     image = scene.views.images[0].permute(1, 2, 0)
     errors = [float((w.color - image).abs().mean(-1)[w.valid].mean()) for w in (right, wrong)]
     assert errors[0] < 0.25 * errors[1]

@@ -170,7 +170,7 @@ def test_rows_change_what_they_say_and_nothing_else() -> None:
     assert changed("radius=0.05") == {"radius_factor": 0.05}
     assert changed("steps=80") == {"steps": 80}
     assert changed("surfels") == {"lora_targets": (), "free_depth": True, "free_surfels": True}
-    assert set(changed("no-compatibility")) == {"photometric_weight", "consistency_weight", "polish"}
+    assert set(changed("no-compatibility")) == {"photometric_weight", "polish"}
     assert rows["noise=1/0.01/0"].noise == Noise(1, 0.01, 0)
 
 
@@ -226,7 +226,7 @@ def test_every_dataset_has_the_settings_of_its_script(
     assert (found.geometric_weight, found.depth_weight) == (depths, depths)
     assert (found.lora_rank, found.lora_alpha, found.clip) == (4, 16, 1)
     assert found.lora_targets == ("qkv", "proj", "fc1", "fc2")
-    assert (found.sparse_weight, found.consistency_weight, found.camera_rate, found.structure) == (0, 0, 0, 0)
+    assert (found.sparse_weight, found.camera_rate, found.structure) == (0, 0, 0)
     assert not found.exposure and found.point_dropout == 0
     assert found.ablation.decode_all and found.ablation.source_order == "uniform"
     assert found.targets == EVERY and found.refresh == 1 and found.polish.polish_looks == 0
@@ -269,10 +269,7 @@ def test_adapt_only_is_no_compatibility_with_views_compared() -> None:
         row.config(TCOConfig()) for row in parse_rows(["adapt-only", "no-compatibility"], ["pose"])
     )
     assert adapt == replace(TCOConfig(), polish=silent.polish) and silent.polish.polish_looks == 0
-    back = replace(
-        silent, photometric_weight=adapt.photometric_weight, consistency_weight=adapt.consistency_weight
-    )
-    assert back == adapt
+    assert replace(silent, photometric_weight=adapt.photometric_weight) == adapt
 
 
 def test_published_figures_have_their_source_and_their_gaps() -> None:

@@ -3,7 +3,7 @@ import { css, data, digits, gradient, heat, make, onSelect, percent, select, u8,
 import { axes, dense, sparse } from './scene.js';
 
 const TERMS = {
-  loss: 'Weighted sum that is lowered', photometric: 'Colours: rendered against seen', warped: 'Colours: looked up against seen', sparse: 'Error at the points that are used', consistency: 'Disagreement of the depths of two views',
+  loss: 'Weighted sum that is lowered', photometric: 'Colours: rendered against seen', warped: 'Colours: looked up against seen', sparse: 'Error at the points that are used',
   geometric: 'Depths: rendered against predicted', depth: 'Departure from given depths', cameras: 'Departure from COLMAP’s cameras', smoothness: 'Roughness of what the depths were changed by', hidden: 'Error at points that were hidden', held_out: 'Error at held-out points, of the view of each step',
   rotation: 'Rotations against COLMAP’s', translation: 'Centres against COLMAP’s', focal: 'Focal lengths against COLMAP’s',
   own_rotation: 'The network’s own cameras: rotations', own_translation: 'The network’s own cameras: centres', own_focal: 'The network’s own cameras: focal lengths',

@@ -18,7 +18,7 @@ function head() {
     [time(total), report.seconds.optimisation < 0.1 ? 'in this run; the depth maps were there' : 'in all'],
   ];
   id('head').append(make('h1', {}, data.title), make('ul', { class: 'facts' }, ...facts.map(([value, name]) => make('li', {}, make('b', {}, value), make('span', {}, name)))));
-  if (!held.plausible) id('head').append(make('p', { class: 'warn' }, `The depths contradict COLMAP’s points: their median error is ${percent(held.error)}, where one depth for each view would have ${percent(held.error_of_one_depth)}. Do not use them.`));
+  if (report.doubt) id('head').append(make('p', { class: 'warn' }, `${report.doubt[0].toUpperCase()}${report.doubt.slice(1)}.`));
   if (report.no_points) id('head').append(make('p', { class: 'warn' }, report.no_points));
 }
 
