@@ -169,9 +169,9 @@ def soft_argmax(scores: Tensor, background: Tensor | None = None, radius: int = 
     """Expected plane index around the likeliest place and the probability of that neighbourhood, (B, h, w).
 
     The likeliest place is the middle of the three neighbouring planes that are most probable together: a
-    surface lies between planes, which share its probability. The planes of the background share nothing, all
-    that is far is on them, so that whatever is in doubt would be put there: they are asked only where they
-    are more probable than ``DOUBT`` together, and then alone.
+    surface lies between planes, which share its probability. All that is far is on the few planes of the
+    background, so that whatever is in doubt would be put there: the place is on them only where they are more
+    probable than ``DOUBT`` together, and on the others elsewhere. The mean is over all planes around it.
 
     Args:
         scores: (B, D, h, w) of the planes, logarithms of probabilities up to a constant.
@@ -180,10 +180,11 @@ def soft_argmax(scores: Tensor, background: Tensor | None = None, radius: int = 
     """
     p = scores.softmax(1)
     index = torch.arange(scores.shape[1], device=scores.device, dtype=scores.dtype).view(1, -1, 1, 1)
+    together = F.avg_pool3d(p.detach().unsqueeze(1), (3, 1, 1), 1, (1, 0, 0)).squeeze(1)
     if background is not None:
         behind = background[..., None, None]
-        p = p * (behind == ((p * behind).sum(1, keepdim=True) > DOUBT))
-    together = F.avg_pool3d(p.detach().unsqueeze(1), (3, 1, 1), 1, (1, 0, 0)).squeeze(1)
+        allowed = behind == ((p.detach() * behind).sum(1, keepdim=True) > DOUBT)
+        together = together.where(allowed, torch.full_like(together, -1.0))
     near = (index - together.argmax(1, keepdim=True)).abs() <= radius
     p = p * near
     mass = p.sum(1)

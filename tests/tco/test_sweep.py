@@ -331,8 +331,9 @@ def test_what_is_in_doubt_is_no_background() -> None:
     """The first two of eight planes are background: they need more than a third of all probability."""
     rows = {
         (0.3, 0, 0, 0, 0.1, 0.2, 0.25, 0.15): (5 + 0.45 / 0.7, 0.7),  # the mode is background
-        (0.3, 0.3, 0, 0, 0, 0.4, 0, 0): (0.5, 0.6),  # what is not background is left out of the mean
-        (0, 0.2, 0.4, 0.4, 0, 0, 0, 0): (2.5, 0.8),  # and the other way round
+        (0.3, 0.3, 0, 0, 0, 0.4, 0, 0): (0.5, 0.6),
+        (0, 0.2, 0.4, 0.4, 0, 0, 0, 0): (2.2, 1.0),  # a surface before it may share its planes
+        (0, 0.4, 0.6, 0, 0, 0, 0, 0): (1.6, 1.0),  # and what is between the two has the same depth by either
     }
     p = torch.tensor(list(rows), dtype=torch.float64).T.reshape(1, 8, 1, len(rows))
     background = torch.arange(8).view(1, -1) < 2
@@ -340,6 +341,20 @@ def test_what_is_in_doubt_is_no_background() -> None:
     expected = torch.tensor(list(rows.values()), dtype=torch.float64)
     torch.testing.assert_close(index[0, 0], expected[:, 0])
     torch.testing.assert_close(mass[0, 0], expected[:, 1])
+
+
+@pytest.mark.parametrize("planes", [1, 2, 4])
+def test_a_surface_beyond_the_farthest_points_is_where_its_planes_say(planes: int) -> None:
+    """Whatever its depth: no jump where the background's probability passes the third."""
+    place = torch.linspace(0, 6.9, 70, dtype=torch.float64)
+    below = place.floor().long()
+    p = torch.zeros(8, 70, dtype=torch.float64)
+    p.scatter_(0, below[None], 1 - (place - below)[None])
+    p.scatter_add_(0, below[None] + 1, (place - below)[None])
+    background = torch.arange(8).view(1, -1) < planes
+    index, mass = soft_argmax(p.clamp_min(1e-30).log().view(1, 8, 1, 70), background)
+    torch.testing.assert_close(index[0, 0], place)
+    torch.testing.assert_close(mass[0, 0], torch.ones_like(place))
 
 
 def test_neighbouring_planes_count_together() -> None:
