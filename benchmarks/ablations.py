@@ -60,9 +60,13 @@ def variants(decoder: nn.Module, plain: TCOConfig) -> Iterator[tuple[str, TCOCon
         "depths of pixels instead of the network",
         ablation(replace(plain, lora_targets=()), free_depth=True, free_rate=2e-3),
     )
+    yield (
+        "surfels of pixels instead of the network",
+        ablation(replace(plain, lora_targets=()), free_depth=True, free_surfels=True, free_rate=2e-3),
+    )
     yield "radii and orientations learned, too", ablation(free_surfels=True)
     yield "opaque surfels", ablation(confident_opacity=False)
-    for factor in (0.05, 1.0, 2.0):
+    for factor in (0.05, 1.0, 2.0, 5.0):
         yield f"radius factor {factor}", ablation(radius_factor=factor)
     for name in ("photometric", "sparse"):
         yield f"without the {name} term", replace(plain, **{f"{name}_weight": 0.0})  # type: ignore[arg-type]

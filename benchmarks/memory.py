@@ -40,7 +40,7 @@ Size = tuple[int, int, int]
 PIPELINE = "pipeline"
 COUNTED = ("vggt", "pi3", "mini", "da3", "da3-small")
 FITTED: dict[str, tuple[Size, ...]] = {
-    "sweep": ((4, 128, 96), (4, 256, 192), (15, 256, 192), (4, 512, 384), (15, 512, 384)),
+    "sweep": ((4, 128, 96), (4, 256, 192), (15, 256, 192), (4, 512, 384), (15, 512, 384), (60, 256, 192)),
     PIPELINE: ((4, 128, 96), (12, 256, 192), (4, 512, 384)),
     **dict.fromkeys(("vggt", "pi3"), ((2, 280, 210), (4, 518, 392), (12, 518, 392))),
     "mini": ((2, 256, 192), (4, 256, 192), (4, 512, 384)),
@@ -48,14 +48,14 @@ FITTED: dict[str, tuple[Size, ...]] = {
 }
 """What the fits are made of."""
 CHECKED: dict[str, tuple[Size, ...]] = {
-    "sweep": ((7, 256, 192), (9, 384, 288), (15, 384, 288), (7, 512, 384)),
+    "sweep": ((7, 256, 192), (9, 384, 288), (15, 384, 288), (7, 512, 384), (40, 256, 192), (128, 256, 192)),
     PIPELINE: ((9, 384, 288),),
     **dict.fromkeys(COUNTED, ((3, 140, 98), (2, 280, 210))),
     "mini": ((3, 136, 96), (2, 280, 208)),
 }
 """What they are checked with."""
 MODES = {"forward": 0, "optimised": 1, "recomputed": 1}
-"""Steps; one passes every place that allocates, where the views are tied to each other from the first."""
+"""Steps; one passes every place that allocates."""
 POLISH_LOOKS = 1
 """On the depths after them; the first already holds all that the later ones do."""
 COPIES = {"cpu": 1.2, "cuda": 1.0}

@@ -262,7 +262,7 @@ MUTATIONS = [
         "tco/terms.py",
         "terms toy optimize",
         ("if weight > 0}", "}"),
-        ("return angle + 2 * centres", "return angle - 2 * centres"),
+        ("getattr(known, name) * penalties.held", "penalties.held"),
         ("mask = (self.depth > 0)", "mask = (self.depth >= 0)"),
         ("known = prediction if len", "known = context if len"),
         ("pixel_centre=0.0, confident", "pixel_centre=0.5, confident"),

@@ -39,20 +39,25 @@ class Footprint:
         per_step: what one step or one decoding takes beside that, bytes a pixel of the canvas.
         measured: on what kind of device it was measured, for a published network all but its own tensors,
             which are counted; empty if it is derived from another device's.
+        before: of an optimisation, the prediction of all views that comes before its steps: of many views it
+            can take more than a step.
     """
 
     fixed: float
     per_view: float
     per_step: float
     measured: str
+    before: Footprint | None = None
 
     def bytes(self, views: int, pixels: int) -> int:
         """Peak of a chunk of so many views on a canvas of so many pixels."""
-        return round(self.fixed + pixels * (views * self.per_view + self.per_step))
+        own = round(self.fixed + pixels * (views * self.per_view + self.per_step))
+        return own if self.before is None else max(own, self.before.bytes(views, pixels))
 
     def views(self, pixels: int, room: float) -> float:
         """How many views fit into so many bytes, not rounded and not limited."""
-        return (room - self.fixed - pixels * self.per_step) / (pixels * self.per_view)
+        own = (room - self.fixed - pixels * self.per_step) / (pixels * self.per_view)
+        return own if self.before is None else min(own, self.before.views(pixels, room))
 
 
 def footprint(
@@ -69,6 +74,8 @@ def footprint(
         steps: of optimisation; 0 takes less.
         dtype: of the products of published networks, if it is not that in which the device takes them.
         recompute: whether activations are computed again in the backward pass, by networks that can.
+
+    Where adapters change the last blocks alone, less is needed than this says: it is of adapters on all.
     """
     kind, mode = network.removesuffix("-commercial"), "optimised" if steps else "forward"
     where = f"{'cuda' if device == 'cuda' else 'cpu'}:{dtype or _products(device)}"
@@ -80,8 +87,9 @@ def footprint(
         fixed = max(0.0, fixed - _footprints.PROCESS)
     more = counts or (0.0, 0.0, 0.0)
     return Footprint(
-        fixed + more[0], per_view + more[1], per_step + more[2], measured=place if place == device else ""
-    )
+        fixed + more[0], per_view + more[1], per_step + more[2], place if place == device else "",
+        footprint(network, device, 0, dtype) if steps else None,
+    )  # fmt: skip
 
 
 def recomputed(network: str, device: str, steps: int, room: tuple[int, int, int], choice: str) -> bool:

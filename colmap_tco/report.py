@@ -71,16 +71,20 @@ def held_out(result: Result) -> dict[str, Any]:
 SMALL_ERROR = 0.02
 """Relative depth error that is good in any scene."""
 
-STRANGE = {"rotation_degrees": 10.0, "centre": 0.75}
-"""Disagreement of a network's own cameras with COLMAP's from which on it has not understood the views.
-Centres that know nothing of them are off by about 1, in units of their mean distance from the middle."""
+STRANGE_ROTATION = 10.0
+"""Degrees between a network's own cameras and COLMAP's from which on it has not understood the views."""
+
+STRANGE_CENTRES = {"centre": 0.75, "centre_over_depth": 0.05}
+"""The same of their centres, in units of their mean distance from the middle and of the depth of the points,
+if both are exceeded: what knows nothing of the cameras is off by about 1 of the first, and where they hardly
+moved they are off by as much though a network knows them to a hundredth of the depth."""
 
 
 def doubt(held: Mapping[str, Any], chunks: Sequence[Mapping[str, Any]]) -> str:
     """Why the depths should not be used, or nothing.
 
     They contradict COLMAP's points. Or they agree with them because they were moved there, and the network
-    that they come from, which finds cameras itself, found others.
+    that they come from, which finds cameras itself, found others. (Depth Anything 3 is told the cameras.)
 
     Args:
         held: of :func:`held_out`.
@@ -91,16 +95,21 @@ def doubt(held: Mapping[str, Any], chunks: Sequence[Mapping[str, Any]]) -> str:
             f"the depths contradict COLMAP's points (median error {100 * held['error']:.0f} %, where one "
             f"depth for each view would have {100 * held['error_of_one_depth']:.0f} %): do not use them"
         )
-    found = [chunk["agreement"] for chunk in chunks if chunk["agreement"]]
-    strange = [one for one in found if any(one[part] > bound for part, bound in STRANGE.items())]
+    strange = [chunk["agreement"] for chunk in chunks if chunk["agreement"] and _strange(chunk["agreement"])]
     if not strange:
         return ""
-    worst = max(strange, key=lambda one: one["centre"])
+    worst = max(strange, key=lambda one: one["rotation_degrees"])
     turn, shift = f"{worst['rotation_degrees']:.1f}°", f"{100 * worst['centre']:.0f} %"
+    where = f" in {len(strange)} of {len(chunks)} groups of views" if len(chunks) > 1 else ""
     return (
-        f"the network's own cameras contradict COLMAP's (rotations by {turn}, centres by {shift} of their "
-        "spread): between COLMAP's points its depths mean nothing, do not use them"
+        f"the network's own cameras contradict COLMAP's{where} (rotations by {turn}, centres by {shift} of "
+        "their spread): between COLMAP's points its depths mean nothing there, do not use them"
     )
+
+
+def _strange(agreement: Mapping[str, float]) -> bool:
+    far = all(agreement[part] > bound for part, bound in STRANGE_CENTRES.items())
+    return far or agreement["rotation_degrees"] > STRANGE_ROTATION
 
 
 def versions() -> dict[str, str]:

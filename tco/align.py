@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from tco.backbones.base import Backbone, RunsAhead
 from tco.config import knob
-from tco.penalties import held, inverse_depth_error, rotation_angle
+from tco.penalties import held, in_first_view, inverse_depth_error, rotation_angle
 from tco.types import Cameras, HeldCameras, Prediction, Priors, SparseDepth, Views
 
 logger = logging.getLogger(__name__)
@@ -173,8 +173,10 @@ class KnownCameras(nn.Module):
 
     Attributes:
         history: unweighted penalties of each differentiable prediction.
-        agreement: degrees and relative centre error between the network's cameras and the given ones after
-            alignment, medians over views, of the last prediction.
+        agreement: between the network's cameras and the given ones after alignment, medians over views, of
+            the last prediction: ``rotation_degrees``; ``centre``, the distance of the centres over their mean
+            distance from their middle; ``centre_over_depth``, over the median depth of the points. Empty
+            where the given cameras tell no scale.
     """
 
     uses_cameras = False
@@ -231,7 +233,7 @@ class KnownCameras(nn.Module):
         if torch.is_grad_enabled() and depth.requires_grad:
             depth = _Carry.apply(depth, self._penalty(predicted.cameras, encoded.priors))
         else:
-            self._compare(predicted.cameras, given)
+            self._compare(predicted.cameras, given, encoded.points)
         return Prediction(depth, predicted.confidence, given, predicted.views)
 
     def _scales(self, predicted: Prediction, encoded: Aligned) -> Tensor:
@@ -267,18 +269,26 @@ class KnownCameras(nn.Module):
         return torch.stack([weight * value for weight, value in terms.values()]).sum()
 
     @torch.no_grad()
-    def _compare(self, predicted: Cameras, given: Cameras) -> None:
+    def _compare(self, predicted: Cameras, given: Cameras, points: Sequence[SparseDepth]) -> None:
+        """Set ``agreement``; centres that are all in one place are put into the middle of the given ones."""
         ours, theirs = predicted.world_from_cam, given.world_from_cam
-        if len(ours) < 2 or not (_spread(ours) and _spread(theirs)):
+        self.agreement = {}
+        if len(ours) < 2 or not _spread(theirs):
             return
-        moved = align_cameras(ours, theirs).poses(ours)
+        if _spread(ours):
+            moved = align_cameras(ours, theirs).poses(ours)
+        else:
+            moved = theirs[:1] @ in_first_view(ours)
+            moved[:, :3, 3] = theirs[:, :3, 3].mean(0)
         angle = rotation_angle(moved[:, :3, :3], theirs[:, :3, :3])
-        centres = theirs[:, :3, 3]
-        size = (centres - centres.mean(0)).norm(dim=-1).mean()
-        away = (moved[:, :3, 3] - centres).norm(dim=-1) / size
+        away = (moved[:, :3, 3] - theirs[:, :3, 3]).norm(dim=-1).median()
+        size = (theirs[:, :3, 3] - theirs[:, :3, 3].mean(0)).norm(dim=-1).mean()
+        depth = torch.cat([part.depth for part in points]).median()
         self.agreement = {
-            "rotation_degrees": float(torch.rad2deg(angle).median()), "centre": float(away.median())
-        }  # fmt: skip
+            "rotation_degrees": float(torch.rad2deg(angle).median()),
+            "centre": float(away / size),
+            "centre_over_depth": float(away / depth),
+        }
 
 
 def _spread(poses: Tensor) -> bool:

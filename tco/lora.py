@@ -94,6 +94,7 @@ def changed(module: nn.Module, config: LoRAConfig) -> list[str]:
     Raises:
         ValueError: a pattern that fits nothing, or a layer that cannot be adapted.
     """
+    _unfrozen(module, config.unfrozen)
     whole = [n for n, _ in module.named_modules() if n and any(matches(n, p) for p in config.unfrozen)]
     return [*select(module, config.targets), *whole]
 

@@ -157,10 +157,15 @@ class _Run:
         """Low-rank adapters, drawn from this run's generator; what comes before them is computed, once."""
         c, decoder = self.config, self.backbone.decoder()
         lora = LoRAConfig(c.lora_rank, c.lora_alpha, self._targets(), c.ablation.unfrozen)
-        names = changed(decoder, lora)
-        if names and isinstance(self.backbone, RunsAhead):
-            self.encoded = self.backbone.ahead(self.encoded, names)
+        self.changing = changed(decoder, lora)
+        self.encoded = self._ahead(self.encoded)
         return adapted(decoder, lora, self.generator)
+
+    def _ahead(self, encoded: Any) -> Any:
+        """With what comes before the adapters computed, by networks that can."""
+        return (
+            self.backbone.ahead(encoded, self.changing) if isinstance(self.backbone, RunsAhead) else encoded
+        )
 
     def _targets(self) -> tuple[str, ...]:
         """Patterns of the layers to adapt: as given; of the default those that fit any."""
@@ -332,7 +337,8 @@ class _Run:
         if self.corrections is None or not self._moved(self.corrections):
             return False
         self.encoded_cameras = self.corrections()
-        self.encoded = self.backbone.encode(self.views, replace(self.priors, cameras=self.encoded_cameras))
+        priors = replace(self.priors, cameras=self.encoded_cameras)
+        self.encoded = self._ahead(self.backbone.encode(self.views, priors))
         return True
 
     def _moved(self, corrections: CameraCorrections) -> bool:

@@ -14,7 +14,7 @@ from tco.corrections import CameraCorrections
 from tco.objective import NothingVisibleError, ObjectiveConfig, geometric, photometric
 from tco.options import TCOConfig
 from tco.surfels import Adjustment, SurfelConfig, Surfels, from_depth
-from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
+from tco.types import Cameras, HeldCameras, Prediction, Priors, SparseDepth, Views
 from tco.warping import warp, warped_photometric
 
 logger = logging.getLogger(__name__)
@@ -97,7 +97,11 @@ class Terms:
             raise ValueError("depth_weight is set and the dense depth is empty: all of it is 0 or masked out")
 
     def weights(self, movable: bool) -> dict[str, float]:
-        """The weight of each term; one that is not here is not computed. ``movable``: given cameras are."""
+        """The weight of each term; one that is not here is not computed.
+
+        Args:
+            movable: whether given cameras may move, and so have a term that holds them.
+        """
         c = self.config
         cameras = 1.0 if c.ablation.plain_cameras else c.camera_weight
         every = {
@@ -216,9 +220,9 @@ class Terms:
         if not self.config.ablation.plain_cameras:
             return corrections.penalty(self.config.camera_kernel)
         assert self.given is not None
-        pose, given = cameras.world_from_cam, self.given.world_from_cam
-        angle, centres = penalties.rotation(pose, given), penalties.translation(pose, given)
-        return angle + 2 * centres + 0.01 * penalties.focal(cameras.K, self.given.K)
+        known, published = HeldCameras(self.given), self.config.ablation.published_objective
+        parts = [getattr(known, name) * penalties.held(name, cameras, known, published) for name in HELD]
+        return torch.stack(parts).sum()
 
 
 def comparison(config: TCOConfig) -> tuple[ObjectiveConfig, SurfelConfig]:

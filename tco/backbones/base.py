@@ -61,6 +61,6 @@ class RunsAhead(Protocol):
 
         Args:
             encoded: of :meth:`Backbone.encode`.
-            changed: dotted names of the layers of :meth:`Backbone.decoder` that change, not empty.
+            changed: dotted names of the layers of :meth:`Backbone.decoder` that change.
         """
         ...

@@ -240,7 +240,7 @@ class DA3(nn.Module):
     def ahead(self, encoded: Tokens, changed: Collection[str]) -> Tokens:
         """The same, with the blocks before the first that changes behind it, an even number of them."""
         c = self.network.config
-        depth = min(first_block(changed, c.start), c.depth - 1) // 2 * 2
+        depth = min(first_block(changed, c.depth - c.start, c.start), c.depth - 1) // 2 * 2
         x, kept = encoded.tokens, dict[int, Tensor]()
         with computing(encoded.tokens.device, self.dtype):
             for i, one, after in self._passing(encoded, Passed(c.start, x), depth):

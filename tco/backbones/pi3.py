@@ -164,7 +164,8 @@ class Pi3(nn.Module):
     @torch.no_grad()
     def ahead(self, encoded: Patches, changed: Collection[str]) -> Patches:
         """The same, with the blocks before the first that changes behind it; the last is always ahead."""
-        n, depth = self.network, min(first_block(changed), self.network.config.depth - 1)
+        n, count = self.network, self.network.config.depth
+        depth = min(first_block(changed, count), count - 1)
         with computing(encoded.tokens.device, self.dtype):
             passed = n.passing(n.begun(encoded.tokens), encoded.grid, depth)
         return replace(encoded, passed=passed)

@@ -23,16 +23,13 @@ class Passed:
     kept: Mapping[int, Tensor] = field(default_factory=dict)
 
 
-def first_block(changed: Collection[str], start: int = 0) -> int:
+def first_block(changed: Collection[str], count: int, start: int = 0) -> int:
     """Index of the first block that changes, plus ``start``; ``start`` for a name that is of no block.
 
     Args:
         changed: dotted names of layers in lists of blocks; ``frame_blocks.3.attn.qkv`` is in block 3.
         start: index of the first block in the lists.
-
-    Raises:
-        ValueError: nothing changes.
+        count: of the blocks in them: the result where nothing changes.
     """
-    if not changed:
-        raise ValueError("no layer of the decoder changes, so that there is no first block that does")
-    return start + min(next((int(p) for p in name.split(".") if p.isdigit()), 0) for name in changed)
+    of_names = (next((int(p) for p in name.split(".") if p.isdigit()), 0) for name in changed)
+    return start + min(of_names, default=count)

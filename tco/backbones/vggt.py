@@ -233,7 +233,8 @@ class VGGT(nn.Module):
     @torch.no_grad()
     def ahead(self, encoded: Patches, changed: Collection[str]) -> Patches:
         """The same, with the depths before the first that changes behind it; the last is always ahead."""
-        depth = min(first_block(changed), self.network.config.depth - 1)
+        count = self.network.config.depth
+        depth = min(first_block(changed, count), count - 1)
         with computing(encoded.tokens.device, self.dtype):
             passed = self.network.aggregator.ahead(encoded.tokens, encoded.grid, depth)
         return replace(encoded, passed=passed)

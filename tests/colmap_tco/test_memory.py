@@ -59,6 +59,14 @@ def test_views_and_bytes_are_inverse() -> None:
             assert chunk_limit(needs, pixels, round(needs.bytes(views, pixels) / SHARE) + 1000, 40) == views
 
 
+def test_what_comes_before_the_steps_can_need_most() -> None:
+    """Of few views a step needs more, of many the prediction of all: 100 a view against 40 and 1200."""
+    needs = Footprint(0.0, 40.0, 1200.0, "cpu", Footprint(0.0, 100.0, 0.0, "cpu"))
+    assert [needs.bytes(views, 10) for views in (2, 20, 40)] == [12_800, 20_000, 40_000]
+    for views in (2, 20, 40):
+        assert needs.views(10, needs.bytes(views, 10)) == pytest.approx(views)
+
+
 def test_chunks_grow_with_the_memory_and_shrink_with_the_images() -> None:
     needs = footprint("sweep", "cpu", steps=40)
     memories = np.logspace(6, 13, 40).astype(int).tolist()
@@ -76,7 +84,8 @@ def test_every_network_has_a_footprint(name: str, steps: int) -> None:
     cpu, cuda = footprint(name, "cpu", steps), footprint(name, "cuda", steps)
     assert cpu.fixed > PROCESS and cpu.per_view > 0 and cuda.per_view > 0
     assert cuda.fixed < cpu.fixed or cuda.measured
-    assert footprint(name, "cpu", 0).bytes(8, 50_000) <= footprint(name, "cpu", 40).bytes(8, 50_000)
+    for views in (2, 8, 40, 128):
+        assert footprint(name, "cpu", 0).bytes(views, 50_000) <= cpu.bytes(views, 50_000)
 
 
 def test_footprints_are_those_of_the_tables() -> None:

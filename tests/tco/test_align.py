@@ -209,10 +209,28 @@ def test_predictions_have_the_given_cameras_and_scale(network: VGGT, scene: tupl
         torch.testing.assert_close(ratio, ratio[0, :1].expand_as(ratio), rtol=1e-4, atol=0)
         left = scale_to_points(after, points)
         assert left is not None and float(left) == pytest.approx(1, abs=1e-4)
-    assert wrapped.agreement.keys() == {"rotation_degrees", "centre"} and not wrapped.history
+    assert wrapped.agreement.keys() == {"rotation_degrees", "centre", "centre_over_depth"}
+    assert not wrapped.history
     with torch.no_grad():
         one = wrapped.decode(encoded, [1])
     torch.testing.assert_close(one.depth[0], aligned.depth[1], rtol=1e-3, atol=1e-4)
+
+
+def test_centres_in_one_place_agree_with_nothing(network: VGGT, scene: tuple[Views, Priors]) -> None:
+    """They are off by what the given ones are from their middle; the rotations are compared all the same."""
+    priors = scene[1]
+    assert priors.cameras is not None and priors.sparse is not None
+    given = priors.cameras
+    poses = given.world_from_cam.clone()
+    poses[:, :3, 3] = 1.0
+    wrapped = KnownCameras(network)
+    wrapped._compare(Cameras(poses, given.K), given, priors.sparse)
+    assert wrapped.agreement["rotation_degrees"] < 0.1
+    centres = given.world_from_cam[:, :3, 3]
+    away = (centres - centres.mean(0)).norm(dim=-1)
+    assert wrapped.agreement["centre"] == pytest.approx(float(away.median() / away.mean()))
+    wrapped._compare(Cameras(poses[:1], given.K[:1]), given[:1], priors.sparse[:1])
+    assert wrapped.agreement == {}
 
 
 def test_hidden_points_do_not_tell_the_scale(network: VGGT, scene: tuple[Views, Priors]) -> None:

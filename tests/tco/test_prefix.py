@@ -10,6 +10,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from benchmarks.wall import scene
+from tco.align import KnownCameras
 from tco.backbones.base import RunsAhead
 from tco.backbones.prefix import first_block
 from tco.lora import LoRAConfig, adapted, changed
@@ -108,16 +110,29 @@ def test_optimisation_runs_the_first_blocks_once_more_whatever_the_number_of_ste
     assert few[-1] == all_blocks[0] == all_blocks[-1] > 4
 
 
+def test_a_network_that_is_held_to_known_cameras_runs_ahead_too() -> None:
+    backbone, (views, priors) = tiny_vggt(), scene(3, (42, 56))
+    wrapped = KnownCameras(backbone)
+    encoded = wrapped.encode(views, priors)
+    ahead = wrapped.ahead(encoded, names_from(backbone, 2))
+    counts = counted(backbone)
+    with torch.no_grad():
+        plain, again = wrapped.decode(encoded, [2, 0]), wrapped.decode(ahead, [2, 0])
+    assert counts == [1, 1, 1, 1, 2, 2, 2, 2]
+    assert torch.equal(plain.depth, again.depth) and torch.equal(plain.confidence, again.confidence)
+
+
 def test_the_first_block_of_names() -> None:
-    assert first_block(["frame_blocks.3.attn.qkv", "global_blocks.2.mlp.fc1"]) == 2
-    assert first_block(["1.attn.qkv"], start=4) == 5
-    assert first_block(["7.attn", "norm"]) == 0, "a layer that is in no block may come before all"
-    with pytest.raises(ValueError, match="no layer"):
-        first_block([])
+    assert first_block(["frame_blocks.3.attn.qkv", "global_blocks.2.mlp.fc1"], 9) == 2
+    assert first_block(["1.attn.qkv"], 9, start=4) == 5
+    assert first_block(["7.attn", "norm"], 9) == 0, "a layer that is in no block may come before all"
+    assert first_block([], 9, start=4) == 13, "nothing changes: all blocks can be ahead"
 
 
 def test_modules_that_are_trained_in_full_count_as_changed() -> None:
     decoder = tiny_vggt().decoder()
     names = changed(decoder, LoRAConfig(targets=("3.attn.qkv",), unfrozen=("frame_blocks.1.mlp",)))
-    assert first_block(names) == 1
-    assert first_block(changed(decoder, LoRAConfig(targets=("3.attn.qkv",)))) == 3
+    assert first_block(names, 4) == 1
+    assert first_block(changed(decoder, LoRAConfig(targets=("3.attn.qkv",))), 4) == 3
+    with pytest.raises(ValueError, match="fits no parameters"):
+        changed(decoder, LoRAConfig(targets=("3.attn.qkv",), unfrozen=("nothing",)))

@@ -18,7 +18,9 @@ function head() {
     [time(total), report.seconds.optimisation < 0.1 ? 'in this run; the depth maps were there' : 'in all'],
   ];
   id('head').append(make('h1', {}, data.title), make('ul', { class: 'facts' }, ...facts.map(([value, name]) => make('li', {}, make('b', {}, value), make('span', {}, name)))));
-  if (report.doubt) id('head').append(make('p', { class: 'warn' }, `${report.doubt[0].toUpperCase()}${report.doubt.slice(1)}.`));
+  // Reports of earlier versions have no doubts in words.
+  const doubt = report.doubt ?? (held.plausible ? '' : 'the depths contradict COLMAP’s points: do not use them');
+  if (doubt) id('head').append(make('p', { class: 'warn' }, `${doubt[0].toUpperCase()}${doubt.slice(1)}.`));
   if (report.no_points) id('head').append(make('p', { class: 'warn' }, report.no_points));
 }
 
