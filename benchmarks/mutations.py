@@ -57,7 +57,7 @@ MUTATIONS = [
     *_of(
         "tco/backbones/decoder.py",
         "sweep",
-        ("> DOUBT))", "< DOUBT))"),
+        ("keepdim=True) > DOUBT", "keepdim=True) < DOUBT"),
         ("(3, 1, 1), 1, (1, 0, 0)).squeeze", "(1, 1, 1), 1, (0, 0, 0)).squeeze"),
     ),
     *_of(
