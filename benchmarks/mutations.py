@@ -323,7 +323,7 @@ def _run_tests(tree: Path, mutation: Mutation, log: Path, only: str) -> None:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
         status = pytest.main(
-            ["-q", "-x", "--no-header", "-p", "no:cacheprovider", "-k", only, *mutation.tests]
+            ["-q", "-x", "-rfE", "--no-header", "-p", "no:cacheprovider", "-k", only, *mutation.tests]
         )
         sys.stdout.flush()
     os._exit(int(status))
