@@ -21,6 +21,7 @@ $(STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) --constraint constraints.txt --editable ".[dev,hub,las,da3,evaluate]"
 	$(BIN)/python -m pip install --disable-pip-version-check --no-deps depth-anything-3==0.1.1 || echo "Without the package depth-anything-3, --backbone da3 and its tests are left out" >&2
+	$(BIN)/python -m pip install --disable-pip-version-check --no-deps nerfstudio==1.1.5 || echo "Without the package nerfstudio, the test of its reader is left out" >&2
 	@touch $@
 
 demo: $(STAMP)

@@ -119,6 +119,43 @@ def test_the_colmap_command_converts_the_splatting_export(paths: DensePaths, tmp
     )
 
 
+def test_a_trainer_of_splats_reads_the_splatting_export(paths: DensePaths, tmp_path: Path) -> None:
+    """By nerfstudio's own reader: points project, by its cameras and poses, onto the keypoints it finds."""
+    reader = pytest.importorskip(
+        "nerfstudio.data.utils.colmap_parsing_utils",
+        reason="nerfstudio is not installed (pip install --no-deps nerfstudio)",
+    )
+    out = tmp_path / "splats"
+    export("3dgs", paths.root, ExportConfig(output_path=out), Progress())
+    cameras, images, points = reader.read_model(str(out / "sparse" / "0"), ext=".bin")
+    cloud, _, colors = read_ply(paths.ply)
+    order = sorted(points)
+    np.testing.assert_array_equal(np.stack([points[i].xyz for i in order]), cloud)
+    np.testing.assert_array_equal(np.stack([points[i].rgb for i in order]), colors)
+    assert all((out / "images" / image.name).is_file() for image in images.values())
+    for number in order[::7]:
+        point = points[number]
+        assert len(point.image_ids) >= 2
+        for image_id, index in zip(point.image_ids, point.point2D_idxs, strict=True):
+            image = images[image_id]
+            camera = cameras[image.camera_id]
+            assert camera.model == "PINHOLE" and image.point3D_ids[index] == number
+            x, y, z = reader.qvec2rotmat(image.qvec) @ point.xyz + image.tvec
+            fx, fy, cx, cy = camera.params
+            np.testing.assert_allclose([fx * x / z + cx, fy * y / z + cy], image.xys[index], atol=1e-6)
+
+
+def test_the_openmvs_importer_takes_the_export(paths: DensePaths, tmp_path: Path) -> None:
+    program = shutil.which("InterfaceCOLMAP")
+    if program is None:
+        pytest.skip("OpenMVS' InterfaceCOLMAP is not installed, and Debian has no package of it")
+    out = tmp_path / "openmvs"
+    export("openmvs", paths.root, ExportConfig(output_path=out), Progress())
+    words = [program, "-i", str(out), "-o", str(tmp_path / "scene.mvs"), "-w", str(tmp_path)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and (tmp_path / "scene.mvs").stat().st_size > 0, done.stdout + done.stderr
+
+
 def test_the_colmap_command_reads_the_text_export(paths: DensePaths, tmp_path: Path) -> None:
     model = _pycolmap.read_model(paths.sparse)
     shutil.copytree(paths.root, tmp_path / "dense")
