@@ -211,11 +211,10 @@ class _Run:
 
     def step(self, number: int) -> dict[str, float]:
         """One step; returns its terms and their weighted sum."""
-        weights = self.weights
         terms = self._evaluate(number, self.sources.draw(self.config.sources))
         seen = {name: terms.pop(name) for name in ("hidden", "held_out") if name in terms}
         loss = torch.stack(
-            [weights[name] * value for name, value in terms.items()] or [torch.zeros(())]
+            [self.weights[name] * value for name, value in terms.items()] or [torch.zeros(())]
         ).sum()
         if not loss.requires_grad:
             self.history.append({"loss": float(loss)})
