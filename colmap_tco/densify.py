@@ -127,7 +127,8 @@ def densify(
         OutOfMemoryError: not even two views fit.
         MissingError: no such device or weights.
         PartlyDoneError: everything was written, but some views had to be left out, or the depths contradict
-            the points of the model; also where an earlier run with these settings found so.
+            the points of the model, or the network's cameras COLMAP's; also where an earlier run with these
+            settings found so.
     """
     root = existing_root(root)
     progress = progress or Progress()

@@ -70,8 +70,8 @@ def optimize(
 
     Per step, one source view is decoded, becomes surfels, and is rendered into the views that overlap
     it most; the difference in colour, the error at triangulated points and the departure from the camera
-    priors are lowered by Adam on low-rank adapters of the decoder. Then the
-    depths themselves are refined by the same objective (:mod:`tco.polish`).
+    priors are lowered by Adam on low-rank adapters of the decoder. Then the depths themselves are refined by
+    the same objective (:mod:`tco.polish`).
 
     Without cameras among the priors, a network that predicts them is adapted to find them: by dense depths
     (``geometric_weight`` and ``depth_weight``), colours, or both.
