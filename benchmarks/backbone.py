@@ -11,9 +11,9 @@ Operations are the network's alone, counted from the shapes on the meta device, 
 adds, so the share of a step counts all else as time lost. The share is of the rate at which the device
 multiplies matrices of the same dtype, measured before and after each row, so that other programs slow both.
 ``--cpu-time`` divides by the CPU time of the process instead of the wall clock, for one thread on a machine
-that is not idle. With ``--last`` a step adapts so many last blocks alone (of VGGT pairs), and those before are
-run once, ahead of all steps. A row that does not fit the memory says so; ``--recompute`` makes steps fit that
-do not.
+that is not idle. With ``--last`` a step adapts so many last blocks alone (of VGGT pairs), and those before
+are run once, ahead of all steps. A row that does not fit the memory says so; ``--recompute`` makes steps fit
+that do not.
 """
 
 from __future__ import annotations
