@@ -544,7 +544,8 @@ def test_networks_that_predict_cameras_run_through(fresh_room: Room, tmp_path: P
     )
     assert report["settings"]["tco"]["lora_targets"] == ["qkv", "proj", "fc1", "fc2"]
     (chunk,) = report["chunks"]
-    assert chunk["agreement"].keys() == {"rotation_degrees", "centre"} and chunk["reduced"] is False
+    assert chunk["agreement"].keys() == {"rotation_degrees", "centre", "centre_over_depth"}
+    assert chunk["reduced"] is False and "do not use them" in report["doubt"]
     assert {"own_rotation", "own_translation", "own_focal"} <= report["loss"][0][0].keys()
     theirs, sides = poses(fresh_room.root / "sparse" / "0"), (56, 64) if kind == "mini" else (56, 70)
     for name, pose in poses(dense / "sparse").items():
