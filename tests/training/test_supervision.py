@@ -209,22 +209,26 @@ def test_a_pool_draws_as_many_scenes_as_the_pixels_allow_and_grows(data: Path) -
 
 
 def test_a_network_learns_two_scenes(data: Path) -> None:
-    """After 100 steps the camera loss is below half, the error of depth below 0.7, the total below 0.6."""
+    """Over the last of 200 steps the camera loss is below half, the error of depth and the total below 0.6.
+
+    Means of 20 steps: where each single one is depends on the processor.
+    """
     batch = gathered([hold(data / f"00000{k}.npz", (32, 48), CPU) for k in (1, 2)], [range(3)] * 2, (32, 48))
     network = fresh(TINY)
-    optimiser = torch.optim.AdamW(network.parameters(), 2e-3)
+    optimiser = torch.optim.AdamW(network.parameters(), 1e-3)
     seen = []
-    for step in range(100):
-        optimiser.param_groups[0]["lr"] = 2e-3 * min(1.0, (step + 1) / 10)
+    for step in range(200):
+        optimiser.param_groups[0]["lr"] = 1e-3 * min(1.0, (step + 1) / 10)
         optimiser.zero_grad(set_to_none=True)
         loss, found = losses(network, batch, torch.float32)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimiser.step()
         seen.append({"loss": float(loss.detach()), **{k: float(v) for k, v in found.items()}})
-    first, last = seen[0], seen[-1]
+    first = seen[0]
+    last = {name: float(np.mean([figures[name] for figures in seen[-20:]])) for name in first}
     assert last["camera"] < 0.5 * first["camera"]
-    assert last["absrel"] < 0.7 * first["absrel"]
+    assert last["absrel"] < 0.6 * first["absrel"]
     assert last["loss"] < 0.6 * first["loss"]
 
 
