@@ -69,8 +69,20 @@ class NetworkConfig:
         choices=("auto", "always", "never"),
     )
 
+    precision: str = knob(
+        "auto",
+        "type of the network's products and convolutions. auto: bfloat16 where the device is faster in it, "
+        "else float32; all else is float32 in any case",
+        choices=("auto", "float32", "bfloat16"),
+    )
+
     def __post_init__(self) -> None:
         check_range(self, "chunk_size", 0)
+
+    @property
+    def dtype(self) -> str | None:
+        """Name of the type of the products; None: what the device is faster in."""
+        return None if self.precision == "auto" else self.precision
 
 
 class Selected(NamedTuple):
@@ -82,6 +94,7 @@ class Selected(NamedTuple):
         device: where it runs.
         reason: why this one, as a sentence for the user.
         recompute: whether activations are computed again in the backward pass.
+        dtype: name of the type of the products; None: what the device is faster in.
     """
 
     network: Network
@@ -89,6 +102,7 @@ class Selected(NamedTuple):
     device: torch.device
     reason: str
     recompute: bool = False
+    dtype: str | None = None
 
     def describe(self) -> dict[str, object]:
         """For the report."""
@@ -155,8 +169,8 @@ def needed(
     (network, device, steps), (views, pixels) = place, size
     wanted = config.chunk_size or min(views, network.most_views)
     room = (wanted, pixels, free_memory(device))
-    again = recomputed(network.name, device.type, steps, room, config.recompute)
-    return footprint(network.name, device.type, steps, recompute=again), again
+    again = recomputed(network.name, device.type, steps, room, config.recompute, config.dtype)
+    return footprint(network.name, device.type, steps, config.dtype, again), again
 
 
 def choose_device(name: str) -> torch.device:
@@ -201,7 +215,7 @@ def select(config: NetworkConfig) -> Selected:
             f"--backbone {network.name} runs from packages that are not installed "
             f"({', '.join(network.missing())}): {network.install}"
         )
-    return Selected(network, path, device, reason, config.recompute == "always")
+    return Selected(network, path, device, reason, config.recompute == "always", config.dtype)
 
 
 def _owner(path: Path) -> Network:
@@ -260,14 +274,17 @@ def load(selected: Selected) -> Backbone:
     Raises:
         MissingError: its file is not whole, or not what it says.
     """
+    import torch
+
     from tco.backbones.weights import WeightsError
 
     network = selected.network
+    dtype: torch.dtype | None = getattr(torch, selected.dtype) if selected.dtype else None
     module, _, name = network.loader.partition(":")
     loader: Callable[..., Backbone] = getattr(import_module(module), name)
     try:
         again = {"recompute": EVERY_BLOCK} if selected.recompute and network.recomputes else {}
-        backbone = loader(selected.weights, device=selected.device, **again)
+        backbone = loader(selected.weights, device=selected.device, dtype=dtype, **again)
     except WeightsError as error:
         raise MissingError(str(error)) from error
     log.info("network %s (%s); %s", network.name, network.title, selected.reason)

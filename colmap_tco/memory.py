@@ -92,7 +92,9 @@ def footprint(
     )  # fmt: skip
 
 
-def recomputed(network: str, device: str, steps: int, room: tuple[int, int, int], choice: str) -> bool:
+def recomputed(
+    network: str, device: str, steps: int, room: tuple[int, int, int], choice: str, dtype: str | None = None
+) -> bool:
     """Whether activations are to be computed again in the backward pass, which takes a third more time.
 
     Args:
@@ -101,9 +103,10 @@ def recomputed(network: str, device: str, steps: int, room: tuple[int, int, int]
         steps: of optimisation; without any there is no backward pass.
         room: views wanted in a chunk, pixels of the canvas, and bytes that are free.
         choice: ``always``, ``never``, or ``auto``: if else fewer views than wanted would fit.
+        dtype: see :func:`footprint`.
     """
     views, pixels, free = room
-    plain, less = (footprint(network, device, steps, recompute=again) for again in (False, True))
+    plain, less = (footprint(network, device, steps, dtype, again) for again in (False, True))
     if choice == "never" or plain == less:
         return False
     return choice == "always" or plain.views(pixels, SHARE * free) < views

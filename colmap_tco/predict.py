@@ -89,12 +89,13 @@ def predict_chunk(
     Raises:
         InputError: the points do not project where the keypoints are, or an image cannot be read.
     """
-    from tco.align import KnownCameras
+    from tco.align import CameraPenalties, KnownCameras
     from tco.consensus import agreed
     from tco.optimize import errors_at_points, optimize
 
     (backbone, device), (prior_config, tco_config, consensus, seed) = network, settings
-    aligned = None if backbone.uses_cameras else KnownCameras(backbone)
+    penalties = CameraPenalties.of(tco_config)
+    aligned = None if backbone.uses_cameras else KnownCameras(backbone, penalties)
     members = [views[i] for i in chunk.views]
     frame = chunk_frame(tracks, members)
     images, cameras = batch(members, frame, picture, len(chunk.context))

@@ -57,8 +57,8 @@ class Network:
     Attributes:
         name: as ``--backbone`` spells it.
         title: what it is.
-        loader: ``module:function``, called with the file of weights and ``device=``, and with
-            ``recompute=`` if the network ``recomputes``; gives a :class:`tco.backbones.base.Backbone`.
+        loader: ``module:function``, called with the file of weights, ``device=`` and ``dtype=``, and
+            with ``recompute=`` if the network ``recomputes``; gives a :class:`tco.backbones.base.Backbone`.
         kind: whose weights it takes, as :func:`tco.backbones.identify.identify` tells.
         checkpoint: where its weights are published; None if they are in the package, or not made yet.
         training: how weights are made of which there are none yet; empty for all others.

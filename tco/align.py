@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from tco.backbones.base import Backbone, RunsAhead
 from tco.config import knob
+from tco.options import TCOConfig
 from tco.penalties import held, in_first_view, inverse_depth_error, rotation_angle
 from tco.types import Cameras, HeldCameras, Prediction, Priors, SparseDepth, Views
 
@@ -32,7 +33,7 @@ OUTLIER = 0.05
 
 @dataclass(frozen=True)
 class CameraPenalties:
-    """Weights of the published code for the network's own cameras."""
+    """What holds the network's own cameras to the given ones; the weights are those of the published code."""
 
     rotation: float = knob(1.0, "weight of the mean angle to the given rotations, radians")
     translation: float = knob(2.0, "weight of the L1 of normalised centres")
@@ -42,6 +43,18 @@ class CameraPenalties:
         "hold these cameras in standard deviations of COLMAP's, under a robust kernel, all with the weight "
         "of rotations; for cameras that are not exact",
     )
+    kernel: str = knob(
+        "huber",
+        "growth of these penalties beyond 2 standard deviations",
+        choices=("quadratic", "huber", "cauchy"),
+    )
+
+    @classmethod
+    def of(cls, config: TCOConfig) -> CameraPenalties:
+        """As ``own_cameras`` of the optimisation's settings wants them."""
+        if config.own_cameras == "published":
+            return cls()
+        return cls(config.camera_weight, by_uncertainty=True, kernel=config.camera_kernel)
 
     def known(self, priors: Priors) -> HeldCameras:
         """The cameras among the priors as what a network's own are held to.
@@ -55,7 +68,8 @@ class CameraPenalties:
         sigmas = priors.rotation_sigma, priors.centre_sigma, priors.focal_sigma
         if any(sigma is None for sigma in sigmas):
             raise ValueError("by_uncertainty is set, and the cameras have no standard deviations")
-        return HeldCameras(priors.cameras, self.rotation, self.rotation, self.rotation, *sigmas)
+        weights = self.rotation, self.rotation, self.rotation
+        return HeldCameras(priors.cameras, *weights, *sigmas, kernel=self.kernel)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,9 @@ from tco.ssim import ssim
 from tco.surfels import Surfels
 from tco.types import Cameras
 
+SSIM_WINDOW = 7
+"""Side of the window of the structural term, pixels."""
+
 
 class NothingVisibleError(ValueError):
     """No valid target pixel sees the surfels: the views do not overlap, or the depths contradict."""
@@ -40,15 +43,13 @@ class ObjectiveConfig:
         True, "Divide rendered colours by alpha, so that transparency is not taken for darkness."
     )
     exposure: bool = knob(
-        False, "Match mean and contrast of each colour channel for each pair of views before the comparison."
-    )
-    exposure_gradient: bool = knob(
-        False, "Differentiate through the gain and bias of exposure; off, they are constants of the step."
+        False,
+        "Match mean and contrast of each colour channel for each pair of views before the comparison; the "
+        "gain and bias are constants of the step.",
     )
     structure: float = knob(
         0.0, "Share s of the structural term: (1 − s) · L1 + s · (1 − SSIM) / 2. 0.85 is common with SSIM."
     )
-    ssim_window: int = knob(7, "Side of the SSIM window in pixels, odd.")
     renderer: str = knob(
         "surface",
         "Engine that renders the surfels. surface puts the lowest loss at the true depth; cpu and gsplat "
@@ -132,14 +133,11 @@ def color_difference(rendered: Rendered, images: Tensor, weight: Tensor, config:
         color = color / rendered.alpha.clamp_min(1 / 255).unsqueeze(-1)
     image = images.permute(0, 2, 3, 1)
     if config.exposure:
-        shown = color if config.exposure_gradient else color.detach()
-        gain, bias = match_exposure(shown, image, weight)
+        gain, bias = match_exposure(color.detach(), image, weight)
         color = gain * color + bias
     error = (color - image).abs().mean(-1)
     if config.structure > 0:
-        error = (1 - config.structure) * error + config.structure * _dissimilarity(
-            color, image, weight, config
-        )
+        error = (1 - config.structure) * error + config.structure * _dissimilarity(color, image, weight)
     return _mean(error, weight)
 
 
@@ -173,13 +171,13 @@ def match_exposure(color: Tensor, image: Tensor, weight: Tensor) -> tuple[Tensor
     return gain, mean_image - gain * mean_color
 
 
-def _dissimilarity(color: Tensor, image: Tensor, weight: Tensor, config: ObjectiveConfig) -> Tensor:
+def _dissimilarity(color: Tensor, image: Tensor, weight: Tensor) -> Tensor:
     """(1 − SSIM) / 2 of each pixel (T, H, W), averaged over the channels.
 
     Pixels without weight take the target's colour, so that they agree in the windows of the others.
     """
     filled = torch.where((weight > 0).unsqueeze(-1), color, image).permute(0, 3, 1, 2)
-    similarity = ssim(filled, image.permute(0, 3, 1, 2), config.ssim_window)
+    similarity = ssim(filled, image.permute(0, 3, 1, 2), SSIM_WINDOW)
     return ((1 - similarity) / 2).clamp(0, 1).mean(1)
 
 

@@ -162,10 +162,10 @@ class _Run:
         return adapted(decoder, lora, self.generator)
 
     def _ahead(self, encoded: Any) -> Any:
-        """With what comes before the adapters computed, by networks that can."""
-        return (
-            self.backbone.ahead(encoded, self.changing) if isinstance(self.backbone, RunsAhead) else encoded
-        )
+        """With what comes before the adapters computed, by networks that can, if wanted."""
+        if self.config.ablation.run_ahead and isinstance(self.backbone, RunsAhead):
+            return self.backbone.ahead(encoded, self.changing)
+        return encoded
 
     def _targets(self) -> tuple[str, ...]:
         """Patterns of the layers to adapt: as given; of the default those that fit any."""

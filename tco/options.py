@@ -54,6 +54,11 @@ class AblationConfig:
         "composite as published, which moves it by up to half a pixel of parallax",
         choices=("surface", "cpu", "gsplat"),
     )
+    run_ahead: bool = knob(
+        True,
+        "compute what comes before the first adapted block once, by networks that can; without, in every "
+        "step, as published",
+    )
     plain_cameras: bool = knob(
         False,
         "hold cameras by the paper's penalties (angle, normalised centres, focal lengths in pixels; weights "
@@ -180,6 +185,13 @@ class TCOConfig:
         "(logarithmic, lets a wrong prior go)",
         choices=("quadratic", "huber", "cauchy"),
     )
+    own_cameras: str = knob(
+        "published",
+        "what holds a network that finds its cameras to COLMAP's. published: the paper's penalties and "
+        "weights, for cameras that are exact; uncertainty: their errors in standard deviations of COLMAP's, "
+        "with camera_weight and camera_kernel, so that cameras that are known badly pull less",
+        choices=("published", "uncertainty"),
+    )
     reencode: float = knob(
         1.0,
         "pixels by which corrections must have moved a view before the network is given the corrected "
@@ -227,10 +239,11 @@ class TCOConfig:
     def reference_schedule(self) -> TCOConfig:
         """The same objective on the published schedule.
 
-        A source drawn uniformly, all views decoded with gradients in every step, every other view a target.
+        A source drawn uniformly, all blocks run and all views decoded with gradients in every step, every
+        other view a target. What the network multiplies in is its own (``dtype`` of what loads it).
         With ``published_objective`` it is what the published code does.
         """
-        ablation = replace(self.ablation, decode_all=True, source_order="uniform")
+        ablation = replace(self.ablation, decode_all=True, source_order="uniform", run_ahead=False)
         return replace(
             self, sources=1, targets=EVERY, refresh=1, ablation=ablation,
             polish=PolishConfig(polish_looks=0),

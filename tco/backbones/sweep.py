@@ -82,14 +82,6 @@ def joined(stages: Sequence[Stage]) -> Stage:
     return Stage(torch.cat([s.inverse for s in stages]), torch.cat([s.log_error for s in stages]))
 
 
-def mixed(device: torch.device) -> AbstractContextManager[object]:
-    """Convolutions and products in bfloat16 where the device is faster in it, else in float32.
-
-    Float64 is left alone, so that finite differences can be taken.
-    """
-    return computing(device, compute_dtype(device))
-
-
 def channels_last(module: nn.Module) -> None:
     """Lay out the weights of convolutions with channels last, twice as fast on a CPU at these sizes."""
     for m in module.modules():
@@ -106,9 +98,17 @@ class Sweep(nn.Module):
     stride = 16
     uses_cameras = True
 
-    def __init__(self, config: SweepConfig | None = None) -> None:
+    def __init__(self, config: SweepConfig | None = None, dtype: torch.dtype | None = None) -> None:
+        """A network of these sizes, with random weights.
+
+        Args:
+            config: its sizes.
+            dtype: of products and convolutions, float32 or bfloat16; None: what the device is faster in. Of a
+                network in float64 they stay in that, so that finite differences can be taken.
+        """
         super().__init__()
         self.config = c = config or SweepConfig()
+        self.dtype = dtype
         self.features = FeatureNet(c.coarse, c.fine, c.context)
         self.fuse = nn.Sequential(nn.Linear(c.groups[0] + 2, 16), nn.ReLU(), nn.Linear(16, c.volume + 1))
         self.head = Decoder(c)
@@ -117,6 +117,10 @@ class Sweep(nn.Module):
     def decoder(self) -> nn.Module:
         """The part that adapters change."""
         return self.head
+
+    def mixed(self, device: torch.device) -> AbstractContextManager[object]:
+        """Products and convolutions in the network's type inside the block."""
+        return computing(device, self.dtype or compute_dtype(device))
 
     def metadata(self) -> dict[str, object]:
         """Sizes, to be stored with the weights."""
@@ -132,7 +136,7 @@ class Sweep(nn.Module):
             raise ValueError("the sweep network needs cameras, sparse points and overlap as priors")
         if len(views) < 2:
             raise ValueError("a plane sweep needs at least two views")
-        with mixed(views.images.device):
+        with self.mixed(views.images.device):
             coarse, fine, context = self.features(views.images, views.valid)
         lo, hi = inverse_range(priors.sparse, views.images)
         step = (hi - lo) / (self.config.planes - 1)
@@ -174,7 +178,7 @@ class Sweep(nn.Module):
             pairs = torch.stack([reference, sources[:, s]], 1)
             corr, seen = correlate(features, pairs, relative[:, s], planes, self.config.groups[0])
             seen = seen.unsqueeze(-1)
-            with mixed(features.device):
+            with self.mixed(features.device):
                 out = self.fuse(torch.cat([corr, seen, corr.mean(-1, keepdim=True)], -1))
             weight = out[..., -1:].float().clamp(-8, 8).exp() * seen
             total = total + weight * out[..., :-1]
@@ -242,7 +246,7 @@ class Sweep(nn.Module):
         hints = encoded.hints[0][v].as_volume(lo, step, self.config.planes)
         volume = torch.cat([encoded.volume[v], hints], -1).permute(0, 4, 1, 2, 3)
         _, quarter, eighth, sixteenth = (c[v] for c in encoded.context)
-        with mixed(volume.device):
+        with self.mixed(volume.device):
             scores: Tensor = self.head.coarse(volume, (quarter, eighth, sixteenth))
         return scores
 
@@ -278,7 +282,7 @@ class Sweep(nn.Module):
         x = torch.cat([matching, agreement, bump, near, sure, hints.distance.unsqueeze(1)], 1)
         x = x.contiguous(memory_format=torch.channels_last)
         half, quarter, eighth, _ = (m[v] for m in encoded.context)
-        with mixed(x.device):
+        with self.mixed(x.device):
             scores, extra, mask = self.head.refine[k](x, (half, quarter, eighth))
         moved = (scores.softmax(1) * offset).sum(1) + extra[:, 0]
         inverse = (stage.inverse.maximum(lowest) + step * moved).maximum(floor)
@@ -297,7 +301,7 @@ class Sweep(nn.Module):
                 encoded.fine, pairs, relative[:, s], planes, self.config.groups[1], last=True
             )
             corr = corr.flatten(3)
-            with mixed(planes.device):
+            with self.mixed(planes.device):
                 score = self.head.weigh(corr)
             weight = score.float().clamp(-8, 8).exp() * seen.mean(-1, keepdim=True)
             total, weights = total + weight * corr, weights + weight

@@ -63,8 +63,15 @@ def fill(module: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
     module.load_state_dict(tensors)
 
 
-def load_sweep(path: Path = EMBEDDED, device: torch.device | str = "cpu") -> Sweep:
+def load_sweep(
+    path: Path = EMBEDDED, device: torch.device | str = "cpu", dtype: torch.dtype | None = None
+) -> Sweep:
     """The embedded network in evaluation mode; its sizes are in the file's metadata.
+
+    Args:
+        path: a file of its weights.
+        device: where it runs.
+        dtype: of products and convolutions, float32 or bfloat16; None: what the device is faster in.
 
     Raises:
         WeightsError: see :func:`read_file` and :func:`fill`.
@@ -74,7 +81,7 @@ def load_sweep(path: Path = EMBEDDED, device: torch.device | str = "cpu") -> Swe
         raise WeightsError(
             f"{path}: no 'config' in its metadata, so these are not weights of the embedded network"
         )
-    network = Sweep(_sizes(info["config"], path))
+    network = Sweep(_sizes(info["config"], path), dtype)
     fill(network, tensors, path)
     return network.eval().requires_grad_(False).to(device)
 

@@ -6,12 +6,13 @@ import argparse
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 from colmap_tco import flags
-from colmap_tco.backbones import NetworkConfig, Selected, _best, choose_device, load, select, suited
+from colmap_tco.backbones import NetworkConfig, Selected, _best, choose_device, load, needed, select, suited
 from colmap_tco.densify import DensifyConfig
 from colmap_tco.errors import MissingError
 from colmap_tco.published import NETWORKS, PUBLISHED
@@ -21,6 +22,7 @@ from tco.backbones.checkpoints import NETWORK, save
 from tco.backbones.da3 import INSTALL, DA3Config, DA3Network
 from tco.backbones.dinov2 import ViTConfig
 from tco.backbones.pi3 import Pi3Config, Pi3Network
+from tco.backbones.transformer import compute_dtype
 from tco.backbones.vggt import VGGTConfig, VGGTNetwork
 from tco.backbones.weights import EMBEDDED
 from tco.options import TCOConfig
@@ -217,6 +219,24 @@ def test_the_registry_agrees_with_the_networks(tmp_path: Path) -> None:
         assert backbone.stride == network.stride and backbone.name == network.kind
         config = suited(TCOConfig(), network)
         assert layers(backbone.decoder(), config.lora_targets)
+
+
+@pytest.mark.parametrize("kind", ["sweep", "vggt", "pi3", "da3", "mini"])
+def test_the_precision_is_that_of_the_network(kind: str, tmp_path: Path) -> None:
+    """What is asked for is what matrices are multiplied in, and what the memory is planned with."""
+    path = EMBEDDED if kind == "sweep" else written(tmp_path / "mine.safetensors", kind)
+    needs = {}
+    for precision in ("float32", "bfloat16"):
+        config = NetworkConfig(backbone=kind, weights=str(path), device="cpu", precision=precision)
+        chosen = select(config)
+        backbone: Any = load(chosen)
+        assert backbone.dtype is getattr(torch, precision)
+        needs[precision], _ = needed((chosen.network, chosen.device, 5), (4, 10_000), config)
+    assert (needs["float32"] != needs["bfloat16"]) == (kind != "sweep")
+    native = compute_dtype(torch.device("cpu"))
+    assert select(NetworkConfig(backbone=kind, weights=str(path), device="cpu")).dtype is None
+    unasked: Any = load(select(NetworkConfig(backbone=kind, weights=str(path), device="cpu")))
+    assert (unasked.dtype or native) is native
 
 
 def test_a_default_that_the_command_line_names_stands() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -16,7 +16,14 @@ from tco.geometry import rigid, so3_exp
 from tco.lora import LoRAConfig, adapted
 from tco.optimize import optimize
 from tco.options import TCOConfig
-from tco.penalties import focal, rotation, translation
+from tco.penalties import (
+    focal,
+    focal_uncertain,
+    rotation,
+    rotation_uncertain,
+    translation,
+    translation_uncertain,
+)
 from tco.types import Cameras, Priors, SparseDepth, Views
 
 EXACT = {"rtol": 1e-9, "atol": 1e-9}
@@ -316,6 +323,51 @@ def test_optimisation_runs_through_and_lowers_the_penalties(
     assert len(sums) == 10 and min(sums[-3:]) < 0.9 * sums[0]
     assert outcome.prediction.depth.shape == (VIEWS, *SIZE)
     assert all(torch.equal(before[name], tensor) for name, tensor in network.state_dict().items())
+
+
+def test_the_settings_say_what_holds_the_networks_cameras(network: VGGT, scene: tuple[Views, Priors]) -> None:
+    """By uncertainty: each error in its standard deviation, all with the weight and kernel of cameras."""
+    views, priors = scene
+    assert CameraPenalties.of(TCOConfig()) == CameraPenalties(1.0, 2.0, 0.01)
+    config = TCOConfig(own_cameras="uncertainty", camera_weight=0.02, camera_kernel="cauchy")
+    wrapped = KnownCameras(network, CameraPenalties.of(config))
+    encoded = wrapped.encode(views, priors)
+    given, sigma = priors.cameras, priors.rotation_sigma
+    assert given is not None and sigma is not None
+    with adapted(wrapped.decoder(), LoRAConfig(targets=("qkv",))) as parameters:
+        with torch.no_grad():
+            for p in parameters:
+                p.copy_(0.05 * torch.randn(p.shape, generator=torch.Generator().manual_seed(p.numel())))
+        ours = torch.autograd.grad(0 * wrapped.decode(encoded, [1]).depth.sum(), parameters)
+        plain = network.decode(encoded.inner, [1]).cameras
+        poses = plain.world_from_cam, given.world_from_cam
+        terms = {
+            "rotation": rotation_uncertain(*poses, sigma, "cauchy"),
+            "translation": translation_uncertain(*poses, sigma, "cauchy"),
+            "focal": focal_uncertain(plain.K, given.K, sigma, "cauchy"),
+        }
+        theirs = torch.autograd.grad(0.02 * torch.stack(list(terms.values())).sum(), parameters)
+    for a, b in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-5)
+    assert any(float(g.abs().max()) > 0 for g in ours)
+    assert wrapped.history == [pytest.approx({k: float(v.detach()) for k, v in terms.items()}, rel=1e-4)]
+    with pytest.raises(ValueError, match="have no standard deviations"):
+        wrapped.penalties.known(replace(priors, focal_sigma=None))
+
+
+def test_cameras_that_are_known_badly_pull_less(network: VGGT, scene: tuple[Views, Priors]) -> None:
+    """Three times the standard deviation, with errors far beyond it: a third of the pull, as Huber's does."""
+    views, priors = scene
+    pulls = []
+    for factor in (1.0, 3.0):
+        wide = {f.name: factor * getattr(priors, f.name) for f in fields(priors) if f.name.endswith("_sigma")
+                and getattr(priors, f.name) is not None}  # fmt: skip
+        wrapped = KnownCameras(network, CameraPenalties.of(TCOConfig(own_cameras="uncertainty")))
+        encoded = wrapped.encode(views, replace(priors, **wide))
+        with adapted(wrapped.decoder(), LoRAConfig(targets=("qkv",))) as parameters:
+            grads = torch.autograd.grad(0 * wrapped.decode(encoded, [1]).depth.sum(), parameters)
+        pulls.append(torch.cat([g.flatten() for g in grads]))
+    torch.testing.assert_close(pulls[1], pulls[0] / 3, rtol=0.05, atol=1e-6)
 
 
 def test_what_cannot_be_aligned_is_refused(network: VGGT, scene: tuple[Views, Priors]) -> None:

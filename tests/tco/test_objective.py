@@ -175,8 +175,8 @@ def test_structure_ignores_a_small_shift_of_brightness_more_than_l1() -> None:
     "config",
     [
         ObjectiveConfig(occlusion_tolerance=1.0),
-        ObjectiveConfig(occlusion_tolerance=1.0, exposure=True, exposure_gradient=True),
-        ObjectiveConfig(occlusion_tolerance=1.0, structure=0.85, ssim_window=3),
+        ObjectiveConfig(occlusion_tolerance=1.0, unpremultiply=False),
+        ObjectiveConfig(occlusion_tolerance=1.0, structure=0.85),
     ],
 )
 def test_derivatives_match_finite_differences(config: ObjectiveConfig) -> None:
@@ -184,10 +184,24 @@ def test_derivatives_match_finite_differences(config: ObjectiveConfig) -> None:
     small = (slice(None), slice(4), slice(5))
     leaves = [t[small].clone().requires_grad_(True) for t in (rendered.color, rendered.depth, rendered.alpha)]
     cut = Targets(targets.images[..., :4, :5], targets.depth[small])
-    # The moments of exposure are taken with the weights as constants, and so are left out for alpha.
-    leaves[2].requires_grad_(not config.exposure)
     assert torch.autograd.gradcheck(lambda c, d, a: colors(Rendered(c, d, a), cut, config), leaves)
     assert torch.autograd.gradcheck(lambda c, d, a: depths(Rendered(c, d, a), cut, config), leaves)
+
+
+def test_gain_and_bias_of_exposure_are_constants_of_the_step() -> None:
+    """Value and gradient are those of the colours that were matched beforehand, compared as they are."""
+    rendered, targets = scene()
+    color = rendered.color.clone().requires_grad_(True)
+    plain, matched = (ObjectiveConfig(occlusion_tolerance=1.0, exposure=on) for on in (False, True))
+    weight = weights(rendered, targets.depth, None, plain)
+    alpha = rendered.alpha.clamp_min(1 / 255).unsqueeze(-1)
+    gain, bias = match_exposure(rendered.color / alpha, targets.images.permute(0, 2, 3, 1), weight)
+    assert float((gain - 1).abs().max()) > 0.05
+    ours = colors(replace(rendered, color=color), targets, matched)
+    theirs = colors(replace(rendered, color=gain * color + bias * alpha), targets, plain)
+    torch.testing.assert_close(ours, theirs)
+    gradients = (torch.autograd.grad(value, color)[0] for value in (ours, theirs))
+    torch.testing.assert_close(*gradients)
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.3, -0.3])

@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tco.geometry import invert, project, transform, unproject
 from tco.optimize import optimize
 from tco.options import PolishConfig, TCOConfig
 from tco.polish import EDGE, DepthField, _Polishing, displacement, picture_edges, polish, roughness
@@ -178,6 +179,39 @@ def test_hidden_pixels_are_found_by_depths_of_the_moment(scene: Wall) -> None:
     told = (run.now.depth / scene.depth).flatten(1).median(1).values
     levels = len(CONFIG.polish.polish_levels)
     torch.testing.assert_close(told, torch.full_like(told, math.exp(0.05 * levels)))
+
+
+def test_what_a_target_hides_is_not_compared_until_its_depth_says_otherwise(scene: Wall) -> None:
+    """View 1 is told that something stands before the left half of the wall: view 0 learns nothing of it."""
+    config = replace(
+        CONFIG, structure=0.0, exposure=False, sparse_weight=0.0,
+        polish=replace(CONFIG.polish, polish_levels=(1,), polish_sources=4),
+    )  # fmt: skip
+    overlap = torch.zeros(4, 4)
+    overlap[0, 1] = overlap[1, 0] = 10.0
+    assert scene.priors.cameras is not None
+    cameras, width = scene.priors.cameras, scene.depth.shape[2]
+    left = (torch.arange(width) < width // 2).expand_as(scene.depth[1])
+    start = predicted(scene, bump(scene, 0.005))
+    start.depth[1] *= torch.where(left, 0.5, 1.0)
+    terms = Terms(scene.views, replace(scene.priors, overlap=overlap), config)
+    run = _Polishing(start, cameras, terms, config, torch.Generator().manual_seed(0), ())
+    there = invert(cameras.world_from_cam[1:2]) @ cameras.world_from_cam[0]
+    points = unproject(start.depth[0], cameras.K[0]).reshape(1, -1, 3)
+    x = project(transform(there, points), cameras.K[1:2])[0][..., 0].reshape(scene.depth[0].shape)
+    behind, free = (x > 1) & (x < width // 2 - 1), (x > width // 2 + 1) & (x < width - 1)
+    run.gradients()
+    first = run.field.grids[0].grad
+    assert first is not None
+    assert float(first[0][behind].abs().max()) == 0
+    assert float((first[0][free] != 0).float().mean()) > 0.9
+    with torch.no_grad():
+        run.field.grids[1] += torch.where(left, math.log(2), 0.0)
+    run.field.grids[0].grad = None
+    run.gradients()
+    second = run.field.grids[0].grad
+    assert second is not None
+    assert float((second[0][behind] != 0).float().mean()) > 0.9
 
 
 def test_views_that_share_nothing_are_drawn_to_their_points(scene: Wall) -> None:

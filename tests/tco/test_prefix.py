@@ -16,7 +16,7 @@ from tco.backbones.base import RunsAhead
 from tco.backbones.prefix import first_block
 from tco.lora import LoRAConfig, adapted, changed
 from tco.optimize import optimize
-from tco.options import PolishConfig, TCOConfig
+from tco.options import AblationConfig, PolishConfig, TCOConfig
 from tco.types import Priors
 from tests.tco.published import some_views, sum_of, tiny_da3, tiny_pi3, tiny_vggt
 
@@ -94,20 +94,23 @@ def test_what_is_behind_is_not_run_again(tiny: Callable[[], Any]) -> None:
 
 def test_optimisation_runs_the_first_blocks_once_more_whatever_the_number_of_steps() -> None:
     """Once for the prediction before any step, once ahead of the steps."""
-    results = {}
-    for targets in (names_from(tiny_vggt(), 3), ("*qkv",)):
+    results = []
+    last, every = names_from(tiny_vggt(), 3), ("*qkv",)
+    for targets, ahead in ((last, True), (every, True), (last, False)):
         backbone = tiny_vggt()
         counts = counted(backbone)
         depth = torch.rand(3, 42, 56, generator=torch.Generator().manual_seed(3)) + 1
         config = TCOConfig(
             steps=4, lora_targets=targets, photometric_weight=0, depth_weight=1,
-            polish=PolishConfig(polish_looks=0),
+            polish=PolishConfig(polish_looks=0), ablation=AblationConfig(run_ahead=ahead),
         )  # fmt: skip
         optimize(backbone, some_views(), Priors(depth=depth), config)
-        results[targets] = counts
-    few, all_blocks = results.values()
+        results.append(counts)
+    few, all_blocks, published = results
     assert few[:6] == [2] * 6
     assert few[-1] == all_blocks[0] == all_blocks[-1] > 4
+    assert published == all_blocks, "as published, all blocks are run in every step"
+    assert not config.ablation.run_ahead and not TCOConfig().reference_schedule().ablation.run_ahead
 
 
 def test_a_network_that_is_held_to_known_cameras_runs_ahead_too() -> None:

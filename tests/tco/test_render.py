@@ -149,8 +149,10 @@ def test_engines_agree_with_their_twins(name: str, dtype: torch.dtype, engine: s
         assert all(float(g.abs().max()) == 0 for g in our_grads) and float(ours[2].abs().max()) == 0
         return
     for label, a, b in zip((*FIELDS, "pose", "K"), our_grads, twin_grads, strict=True):
-        # Grazing surfels divide by a plane's slope of down to 1e-3: float32 keeps fewer digits there.
-        limit = tolerance if dtype == torch.float64 or name != "grazing" else 1e-3
+        # Grazing surfels divide by a plane's slope of down to 1e-3: tensors of float32 lose digits there, and
+        # the loops, which are in float64, do not.
+        lost = dtype == torch.float32 and name == "grazing" and engine == "surface_pairs"
+        limit = 3e-4 if lost else tolerance
         assert float((a.double() - b).norm()) <= limit * float(b.norm()) + 1e-12, label
 
 

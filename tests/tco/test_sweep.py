@@ -53,6 +53,21 @@ def test_reduced_precision_changes_little(
     assert_mostly_equal(got.depth, full.depth, 0.01, 0.95)
 
 
+def test_the_type_of_the_products_can_be_chosen(
+    rendered: Rendered, full: Prediction, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the device is faster in."""
+    monkeypatch.setattr(sweep, "compute_dtype", lambda _: torch.bfloat16)
+    depths = []
+    for dtype in (torch.float32, torch.bfloat16):
+        network = load_sweep(dtype=dtype)
+        with torch.no_grad():
+            depths.append(network.decode(network.encode(*rendered[:2])).depth)
+    assert torch.equal(depths[0], full.depth)
+    assert not torch.equal(depths[1], full.depth)
+    assert_mostly_equal(depths[1], full.depth, 0.01, 0.95)
+
+
 @pytest.fixture(scope="module")
 def network() -> Sweep:
     return load_sweep()
