@@ -15,16 +15,13 @@ not move them.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from tco.surfels import Surfels
 from tco.types import Cameras, _Movable
-
-if TYPE_CHECKING:
-    from tco.render.project import Splats
 
 __all__ = ["ENGINES", "Engine", "Rendered", "render"]
 
@@ -56,32 +53,20 @@ def _cpu(
     surfels: Surfels, cameras: Cameras, size: tuple[int, int], near: float = 0.01
 ) -> tuple[Tensor, Tensor, Tensor]:
     from tco.render.cpu import rasterize
+    from tco.render.project import project
 
-    return _single(surfels, rasterize(_exactly(surfels, cameras, size, near), size))
+    return rasterize(project(surfels, cameras, size, near, torch.float64), size)
 
 
 def _surface(
     surfels: Surfels, cameras: Cameras, size: tuple[int, int], near: float = 0.01
 ) -> tuple[Tensor, Tensor, Tensor]:
     from tco.render.cpu import rasterize_surface
+    from tco.render.project import project
 
     if surfels.means.device.type != "cpu":
         return _surface_pairs(surfels, cameras, size, near)
-    splats = _exactly(surfels, cameras, size, near)
-    return _single(surfels, rasterize_surface(splats, _focal(cameras), size))
-
-
-def _exactly(surfels: Surfels, cameras: Cameras, size: tuple[int, int], near: float) -> Splats:
-    """Splats in float64, in which the loops compute: planes that pass near the camera need the digits."""
-    from tco.render.project import project
-
-    return project(surfels.to(dtype=torch.float64), cameras.to(dtype=torch.float64), size, near)
-
-
-def _single(surfels: Surfels, images: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """Images in the type of the surfels."""
-    color, depth, alpha = (image.to(surfels.means.dtype) for image in images)
-    return color, depth, alpha
+    return rasterize_surface(project(surfels, cameras, size, near, torch.float64), _focal(cameras), size)
 
 
 def _surface_pairs(

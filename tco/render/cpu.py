@@ -2,7 +2,8 @@
 
 Each splat adds itself to the pixels of its box, so that the state is a few numbers a pixel and nothing
 grows with surfels × pixels. The backward pass repeats the walk. Arithmetic is in float64 whatever the
-type of the tensors, so that both walks take the same decisions.
+type of the tensors, so that both walks take the same decisions. Ray transforms come in float64, too: planes
+that pass near the camera need the digits.
 """
 
 from __future__ import annotations
@@ -89,7 +90,7 @@ class _Rasterize(torch.autograd.Function):
         ctx.kept = blending, arrays, all_boxes, orders, image, tensors[0].device
         parts = image[..., :3], image[..., 3], image[..., 4]
         color, depth, alpha = (
-            torch.from_numpy(p.astype(arrays[0].dtype)).to(tensors[0].device) for p in parts
+            torch.from_numpy(p.astype(arrays[-1].dtype)).to(tensors[0].device) for p in parts
         )
         return color, depth, alpha
 
@@ -99,15 +100,17 @@ class _Rasterize(torch.autograd.Function):
         upstream = np.empty(image.shape)
         upstream[..., :3], upstream[..., 3], upstream[..., 4] = _array(color), _array(depth), _array(alpha)
         targets, n = boxes.shape[:2]
-        grads = np.zeros((targets, n, 16), arrays[0].dtype)
+        by_transform = np.zeros((targets, n, 9), arrays[0].dtype)
+        others = np.zeros((targets, n, 7), arrays[-1].dtype)
 
         def differentiate(t: int) -> None:
             splats = _pack(arrays, t, orders[t])
-            grads[t][orders[t]] = blending.backward(t, splats, boxes[t][orders[t]], image[t], upstream[t])
+            grads = blending.backward(t, splats, boxes[t][orders[t]], image[t], upstream[t])
+            by_transform[t][orders[t]], others[t][orders[t]] = grads[:, :9], grads[:, 9:]
 
         _each(differentiate, targets)
-        shared = grads[..., 12:].sum(0)
-        per_target = grads[..., :9].reshape(targets, n, 3, 3), grads[..., 9:11], grads[..., 11]
+        shared = others[..., 3:].sum(0)
+        per_target = by_transform.reshape(targets, n, 3, 3), others[..., :2], others[..., 2]
         parts = *per_target, shared[:, 0], shared[:, 1:]
         return None, None, None, *(torch.from_numpy(p).to(device) for p in parts)
 

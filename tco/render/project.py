@@ -41,11 +41,15 @@ class Splats:
     boxes: Tensor
 
 
-def project(surfels: Surfels, cameras: Cameras, size: tuple[int, int], near: float = 0.01) -> Splats:
+def project(
+    surfels: Surfels, cameras: Cameras, size: tuple[int, int], near: float = 0.01,
+    exact: torch.dtype | None = None,
+) -> Splats:  # fmt: skip
     """Splats of N surfels in T target cameras for images of ``size`` (H, W).
 
-    Differentiable in the surfels, the poses and the intrinsics. A surfel is not seen by a target if its
-    centre is nearer than ``near`` (units of length), or if its 1σ ellipse reaches behind the camera.
+    Differentiable in the surfels, the poses and the intrinsics. Ray transforms are computed in the type
+    ``exact``, by default that of the surfels. A surfel is not seen by a target if its centre is nearer than
+    ``near`` (units of length), or if its 1σ ellipse reaches behind the camera.
 
     Raises:
         ValueError: intrinsics whose last row is not 0, 0, 1.
@@ -53,18 +57,19 @@ def project(surfels: Surfels, cameras: Cameras, size: tuple[int, int], near: flo
     last = cameras.K[:, 2].detach()
     if not torch.equal(last, last.new_tensor([0.0, 0.0, 1.0]).expand_as(last)):
         raise ValueError("the last row of K must be 0, 0, 1")
-    pixels_from_world = cameras.K @ invert(cameras.world_from_cam)[:, :3]
-    axes = matrix_from_quat(surfels.quats)[..., :2] * surfels.scales.unsqueeze(-2)
-    frame = torch.cat([axes, surfels.means.unsqueeze(-1)], -1).transpose(-1, -2)
+    exact = exact or surfels.means.dtype
+    pixels_from_world = cameras.K.to(exact) @ invert(cameras.world_from_cam.to(exact))[:, :3]
+    axes = matrix_from_quat(surfels.quats.to(exact))[..., :2] * surfels.scales.to(exact).unsqueeze(-2)
+    frame = torch.cat([axes, surfels.means.to(exact).unsqueeze(-1)], -1).transpose(-1, -2)
     origin = frame.new_tensor([0.0, 0.0, 1.0]).expand(len(surfels), 3).unsqueeze(-1)
     local = torch.cat([frame, origin], -1).reshape(-1, 4)
     transforms = (local @ pixels_from_world.transpose(-1, -2)).reshape(len(cameras), len(surfels), 3, 3)
-    columns = transforms.unbind(-1)
+    columns = transforms.to(surfels.means.dtype).unbind(-1)
     depths = columns[2][..., 2]
     centres, ellipse = _centres(*columns)
     seen = ellipse & (depths > near) & (surfels.opacities > MIN_ALPHA)
     with torch.no_grad():
-        boxes = _boxes(transforms, centres, surfels.opacities, seen, size)
+        boxes = _boxes(torch.stack(columns, -1), centres, surfels.opacities, seen, size)
     return Splats(transforms, centres, depths, surfels.opacities, surfels.colors, boxes)
 
 
