@@ -133,7 +133,7 @@ def main() -> None:
         f"size, with the gradients by depth, confidence, poses and intrinsics; the best of {args.repeat} "
         "runs. Memory is what the peak of a process rises by. surface: the default, compiled loops; "
         "surface_pairs: the same in tensor operations, as on other devices; cpu: compiled loops that "
-        f"composite as published. Brute force: every surfel on every pixel, one view of {SMALL[1]}×{SMALL[0]}, "
+        f"composite as published. Brute force: all surfels on all pixels, one view of {SMALL[1]}×{SMALL[0]}, "
         "extrapolated by surfels × pixels × views."
     )
     text += "\n" + engines(args.threads, args.repeat)

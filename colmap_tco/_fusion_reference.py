@@ -188,7 +188,7 @@ class Reference:
         cosine = math.cos(math.radians(tolerance.normal))
         limits = (tolerance.depth, tolerance.reproj, cosine, config.sigma_at_one, config.most_depth_error)
         for slot, other in group:
-            pair = self._pair(slot, other.camera)
+            pair = self._pair(slot, other.camera).astype(np.float32)
             _vote_kernels.vote(
                 part.tiles, part.votes, other.packed, pair, limits, slot, part.who, part.failed
             )

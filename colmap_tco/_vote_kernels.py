@@ -4,7 +4,9 @@ The pixels are taken in tiles, and each step is a plain loop over a tile without
 which the compiler turns into vector instructions; only the reading of the other view's pixels is one
 by one. That takes a third of the time of one loop over all steps. Each tile's numbers are rows of one
 array, one after the other, since the compiler gives up where it would have to prove of many arrays
-that they do not overlap. All arithmetic is in double precision.
+that they do not overlap. Arithmetic is in single precision, of which a vector holds twice as many numbers:
+coordinates are those of the reference camera, so that the digits go to the scene and not to where it is,
+and are good to a thousandth of a pixel in maps of 8000.
 """
 
 from __future__ import annotations
@@ -33,8 +35,8 @@ VOTE_SIZE = 5 * TILE
 """float32 numbers of these votes; :data:`Votes` is (tiles, neighbours · VOTE_SIZE)."""
 
 # The rows of the scratch of one tile.
-_X, _Y, _DEPTH, _I, _J, _AT = range(0, 6 * TILE, TILE)
-"""The point in the other view: ray, depth, column and row of the pixel, its flat index or −1."""
+_X, _Y, _DEPTH, _I, _J, _INSIDE = range(0, 6 * TILE, TILE)
+"""The point in the other view: ray, depth, column and row of the pixel, and whether it is in the image."""
 _D, _N, _C, _ERROR, _BACK, _AGREE, _TURNED, _LIMIT, _OUTCOME = (
     k * TILE for k in (6, 7, 10, 11, 12, 13, 14, 17, 18)
 )
@@ -55,7 +57,13 @@ _MOST_TILT = 1.05
 
 Tiles = NDArray[np.float32]
 Votes = NDArray[np.float32]
-Scratch = NDArray[np.float64]
+Scratch = NDArray[np.float32]
+Pair = NDArray[np.float32]
+"""Of :func:`colmap_tco._fusion_kernels.pair`, in single precision."""
+
+_0, _HALF, _1 = np.float32(0.0), np.float32(0.5), np.float32(1.0)
+_FLATTEST, _STEEPEST = np.float32(1 / _MOST_TILT), np.float32(_MOST_TILT)
+_INFINITE = np.float32(np.inf)
 
 
 def tiles_of(count: int) -> Tiles:
@@ -90,47 +98,47 @@ def begin(ref: NDArray[np.float32], pixels: NDArray[np.int64], tiles: Tiles) -> 
 
 
 @njit(cache=True, error_model="numpy")
-def _locate(tile: NDArray[np.float32], w: Scratch, pair: NDArray[np.float64], width: int, height: int) -> int:
+def _locate(tile: NDArray[np.float32], w: Scratch, pair: Pair, width: int, height: int) -> int:
     """Where the pixels of a tile lie in the other view; returns how many it contains."""
     cx, cy, ifx, ify = pair[2], pair[3], pair[4], pair[5]
     fu, fv, cu, cv = pair[6], pair[7], pair[8], pair[9]
     a0, a1, a2, a3, b0, b1 = pair[12], pair[13], pair[14], pair[15], pair[16], pair[17]
     b2, b3, c0, c1, c2, c3 = pair[18], pair[19], pair[20], pair[21], pair[22], pair[23]
-    right, bottom, found = float(width), float(height), 0
+    right, bottom, found = np.float32(width), np.float32(height), 0
     for m in range(TILE):
-        z = float(tile[Z + m])
-        x = (float(tile[COL + m]) + 0.5 - cx) * ifx * z
-        y = (float(tile[ROW + m]) + 0.5 - cy) * ify * z
+        z = tile[Z + m]
+        x = (tile[COL + m] + _HALF - cx) * ifx * z
+        y = (tile[ROW + m] + _HALF - cy) * ify * z
         depth = c0 * x + c1 * y + c2 * z + c3
-        inverse = 1.0 / depth
+        inverse = _1 / depth
         there_x = (a0 * x + a1 * y + a2 * z + a3) * inverse
         there_y = (b0 * x + b1 * y + b2 * z + b3) * inverse
         u, v = fu * there_x + cu, fv * there_y + cv
-        inside = (depth > 0.0) & (u >= 0.0) & (u < right) & (v >= 0.0) & (v < bottom)
+        inside = (depth > _0) & (u >= _0) & (u < right) & (v >= _0) & (v < bottom)
         i, j = np.floor(u), np.floor(v)
         w[_X + m], w[_Y + m], w[_DEPTH + m], w[_I + m], w[_J + m] = there_x, there_y, depth, i, j
-        w[_AT + m] = j * right + i if inside else -1.0
+        w[_INSIDE + m] = _1 if inside else _0
         found += inside
     return found
 
 
 @njit(cache=True, error_model="numpy")
-def _fetch(w: Scratch, pixels: NDArray[np.float32]) -> None:
-    """Depth, normal and confidence of the other view, (H W, 5), at the pixels of a tile."""
+def _fetch(w: Scratch, other: NDArray[np.float32]) -> None:
+    """Depth, normal and confidence of the other view, (H, W, 5), at the pixels of a tile."""
     for m in range(TILE):
-        at = np.int64(w[_AT + m])
-        if at < 0:
-            w[_D + m] = 0.0
+        if w[_INSIDE + m] == _0:
+            w[_D + m] = _0
             continue
-        w[_D + m] = pixels[at, 0]
-        w[_N + m] = pixels[at, 1]
-        w[_N + TILE + m] = pixels[at, 2]
-        w[_N + 2 * TILE + m] = pixels[at, 3]
-        w[_C + m] = pixels[at, 4]
+        pixel = other[np.uint32(w[_J + m]), np.uint32(w[_I + m])]
+        w[_D + m] = pixel[0]
+        w[_N + m] = pixel[1]
+        w[_N + TILE + m] = pixel[2]
+        w[_N + 2 * TILE + m] = pixel[3]
+        w[_C + m] = pixel[4]
 
 
 @njit(cache=True, error_model="numpy")
-def _compare(tile: NDArray[np.float32], w: Scratch, pair: NDArray[np.float64]) -> None:
+def _compare(tile: NDArray[np.float32], w: Scratch, pair: Pair) -> None:
     """What differs between the pixels of a tile and the surface of the other view there.
 
     The depth along the ray is that of the tangent plane of the other pixel: exact on planes at every
@@ -145,20 +153,20 @@ def _compare(tile: NDArray[np.float32], w: Scratch, pair: NDArray[np.float64]) -
     for m in range(TILE):
         nx, ny, nz = w[_N + m], w[_N + TILE + m], w[_N + 2 * TILE + m]
         x, y, depth = w[_X + m], w[_Y + m], w[_DEPTH + m]
-        centre_x, centre_y = (w[_I + m] + 0.5 - cu) * ifu, (w[_J + m] + 0.5 - cv) * ifv
+        centre_x, centre_y = (w[_I + m] + _HALF - cu) * ifu, (w[_J + m] + _HALF - cv) * ifv
         ratio = (nx * centre_x + ny * centre_y + nz) / (nx * x + ny * y + nz)
-        flat = (ratio > 1.0 / _MOST_TILT) & (ratio < _MOST_TILT)
-        error = w[_D + m] * (ratio if flat else 1.0) - depth
+        flat = (ratio > _FLATTEST) & (ratio < _STEEPEST)
+        error = w[_D + m] * (ratio if flat else _1) - depth
         dx = a0 * (x * error) + b0 * (y * error) + c0 * error
         dy = a1 * (x * error) + b1 * (y * error) + c1 * error
         dz = a2 * (x * error) + b2 * (y * error) + c2 * error
-        z = float(tile[Z + m])
-        here_x, here_y = (float(tile[COL + m]) + 0.5 - cx) * ifx, (float(tile[ROW + m]) + 0.5 - cy) * ify
-        inverse = 1.0 / (z + dz)
-        du = fx * ((here_x * z + dx) * inverse - here_x)
-        dv = fy * ((here_y * z + dy) * inverse - here_y)
-        w[_BACK + m] = du * du + dv * dv if inverse > 0.0 else np.inf
-        w[_ERROR + m] = error * (1.0 / depth)
+        z = tile[Z + m]
+        here_x, here_y = (tile[COL + m] + _HALF - cx) * ifx, (tile[ROW + m] + _HALF - cy) * ify
+        inverse = _1 / (z + dz)
+        # (here · z + d) / (z + dz) − here, without the cancellation.
+        du, dv = fx * ((dx - here_x * dz) * inverse), fy * ((dy - here_y * dz) * inverse)
+        w[_BACK + m] = du * du + dv * dv if inverse > _0 else _INFINITE
+        w[_ERROR + m] = error * (_1 / depth)
         tx, ty, tz = a0 * nx + b0 * ny + c0 * nz, a1 * nx + b1 * ny + c1 * nz, a2 * nx + b2 * ny + c2 * nz
         w[_AGREE + m] = tx * tile[NX + m] + ty * tile[NY + m] + tz * tile[NZ + m]
         w[_TURNED + m], w[_TURNED + TILE + m], w[_TURNED + 2 * TILE + m] = tx, ty, tz
@@ -167,62 +175,75 @@ def _compare(tile: NDArray[np.float32], w: Scratch, pair: NDArray[np.float64]) -
 @njit(cache=True, error_model="numpy")
 def _allow(tile: NDArray[np.float32], w: Scratch, limits: Limits) -> None:
     """The relative depth errors allowed between the pixels of a tile and those of the other view."""
-    depth_error, _, _, sigma_at_one, most_depth_error = limits
+    depth_error, sigma_at_one = np.float32(limits[0]), np.float32(limits[3])
+    most = max(depth_error, np.float32(limits[4]))
     for m in range(TILE):
         w[_LIMIT + m] = depth_error
-    if sigma_at_one <= 0.0:
+    if sigma_at_one <= _0:
         return
     for m in range(TILE):
-        one, other = float(tile[CONFIDENCE + m]), w[_C + m]
-        sigma = sigma_at_one * np.sqrt(1.0 / (one * one) + 1.0 / (other * other))
-        w[_LIMIT + m] = min(max(depth_error, sigma), max(depth_error, most_depth_error))
+        one, other = tile[CONFIDENCE + m], w[_C + m]
+        sigma = sigma_at_one * np.sqrt(_1 / (one * one) + _1 / (other * other))
+        w[_LIMIT + m] = min(max(depth_error, sigma), most)
 
 
 @njit(cache=True, error_model="numpy")
 def _judge(w: Scratch, limits: Limits) -> None:
     """The outcomes of the comparisons of a tile."""
-    reproj, cosine = limits[1] * limits[1], limits[2]
+    reproj, cosine = np.float32(limits[1] * limits[1]), np.float32(limits[2])
+    unseen, hole, occluded, through = (
+        np.float32(UNSEEN),
+        np.float32(HOLE),
+        np.float32(OCCLUDED),
+        np.float32(THROUGH),
+    )
+    depth, reprojection, normal, agrees = (
+        np.float32(DEPTH), np.float32(REPROJECTION), np.float32(NORMAL), np.float32(AGREES)
+    )  # fmt: skip
+    three = np.float32(3.0)
     for m in range(TILE):
         off = w[_ERROR + m] / w[_LIMIT + m]
-        outcome = 7.0 if w[_AGREE + m] >= cosine else 6.0
-        outcome = outcome if w[_BACK + m] <= reproj else 5.0
-        apart = 3.0 if off > 0.0 else 2.0
-        apart = 4.0 if abs(off) <= 3.0 else apart
-        outcome = outcome if abs(off) <= 1.0 else apart
-        outcome = outcome if w[_D + m] > 0.0 else 1.0
-        w[_OUTCOME + m] = outcome if w[_AT + m] >= 0.0 else 0.0
+        outcome = agrees if w[_AGREE + m] >= cosine else normal
+        outcome = outcome if w[_BACK + m] <= reproj else reprojection
+        apart = through if off > _0 else occluded
+        apart = depth if abs(off) <= three else apart
+        outcome = outcome if abs(off) <= _1 else apart
+        outcome = outcome if w[_D + m] > _0 else hole
+        w[_OUTCOME + m] = outcome if w[_INSIDE + m] > _0 else unseen
 
 
 @njit(cache=True, error_model="numpy")
 def _add(tile: NDArray[np.float32], w: Scratch, votes: NDArray[np.float32], at: int) -> None:
     """Count the votes of the other view on a tile, and note them in ``votes`` from ``at`` on."""
+    unseen, through, agree = np.float32(UNSEEN), np.float32(THROUGH), np.float32(AGREES)
     for m in range(TILE):
-        agrees = w[_OUTCOME + m] == AGREES
-        tile[SEEN + m] += np.float32(w[_OUTCOME + m] > UNSEEN)
-        tile[SUPPORT + m] += np.float32(agrees)
-        tile[CONFLICTS + m] += np.float32(w[_OUTCOME + m] == THROUGH)
+        outcome = w[_OUTCOME + m]
+        tile[SEEN + m] += _1 if outcome > unseen else _0
+        tile[SUPPORT + m] += _1 if outcome == agree else _0
+        tile[CONFLICTS + m] += _1 if outcome == through else _0
     for m in range(TILE):
-        agrees = w[_OUTCOME + m] == AGREES
-        votes[at + WEIGHT + m] = w[_C + m] if agrees else 0.0
-        votes[at + OFF + m] = w[_ERROR + m] if agrees else 0.0
-        votes[at + TURNED + m] = w[_TURNED + m] if agrees else 0.0
-        votes[at + TURNED + TILE + m] = w[_TURNED + TILE + m] if agrees else 0.0
-        votes[at + TURNED + 2 * TILE + m] = w[_TURNED + 2 * TILE + m] if agrees else 0.0
+        agrees = w[_OUTCOME + m] == agree
+        votes[at + WEIGHT + m] = w[_C + m] if agrees else _0
+        votes[at + OFF + m] = w[_ERROR + m] if agrees else _0
+        votes[at + TURNED + m] = w[_TURNED + m] if agrees else _0
+        votes[at + TURNED + TILE + m] = w[_TURNED + TILE + m] if agrees else _0
+        votes[at + TURNED + 2 * TILE + m] = w[_TURNED + 2 * TILE + m] if agrees else _0
 
 
 @njit(cache=True, error_model="numpy")
-def _widen(tile: NDArray[np.float32], w: Scratch, pair: NDArray[np.float64]) -> None:
+def _widen(tile: NDArray[np.float32], w: Scratch, pair: Pair) -> None:
     """Note the angle at each point of a tile between its camera and the other, where they agree."""
     cx, cy, ifx, ify = pair[2], pair[3], pair[4], pair[5]
     there_x = -(pair[12] * pair[15] + pair[16] * pair[19] + pair[20] * pair[23])
     there_y = -(pair[13] * pair[15] + pair[17] * pair[19] + pair[21] * pair[23])
     there_z = -(pair[14] * pair[15] + pair[18] * pair[19] + pair[22] * pair[23])
+    agree = np.float32(AGREES)
     for m in range(TILE):
-        x, y = (float(tile[COL + m]) + 0.5 - cx) * ifx, (float(tile[ROW + m]) + 0.5 - cy) * ify
-        z, before = float(tile[Z + m]), tile[COSINE + m]
+        x, y = (tile[COL + m] + _HALF - cx) * ifx, (tile[ROW + m] + _HALF - cy) * ify
+        z, before = tile[Z + m], tile[COSINE + m]
         a, b, c = x * z - there_x, y * z - there_y, z - there_z
-        cosine = (x * a + y * b + c) / np.sqrt((x * x + y * y + 1.0) * (a * a + b * b + c * c))
-        tile[COSINE + m] = cosine if (w[_OUTCOME + m] == AGREES) & (cosine < before) else before
+        cosine = (x * a + y * b + c) / np.sqrt((x * x + y * y + _1) * (a * a + b * b + c * c))
+        tile[COSINE + m] = cosine if (w[_OUTCOME + m] == agree) & (cosine < before) else before
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -230,7 +251,7 @@ def vote(
     tiles: Tiles,
     votes: Votes,
     other: NDArray[np.float32],
-    pair: NDArray[np.float64],
+    pair: Pair,
     limits: Limits,
     slot: int,
     who: NDArray[np.uint64],
@@ -249,36 +270,37 @@ def vote(
         failed: (3,) counts the comparisons that failed by depth, reprojection and normal.
     """
     height, width = other.shape[0], other.shape[1]
-    pixels = other.reshape(height * width, other.shape[2])
     bits, bit, at = who[slot >> 6], np.uint64(1) << np.uint64(slot & 63), slot * VOTE_SIZE
-    w = np.ones(_SCRATCH)
+    occluded, depth, reprojection = np.float32(OCCLUDED), np.float32(DEPTH), np.float32(REPROJECTION)
+    normal, agrees = np.float32(NORMAL), np.float32(AGREES)
+    w = np.ones(_SCRATCH, np.float32)
     for t in range(len(tiles)):
         tile = tiles[t]
         if _locate(tile, w, pair, width, height) == 0:
             votes[t, at : at + VOTE_SIZE] = 0.0
             continue
-        _fetch(w, pixels)
+        _fetch(w, other)
         _compare(tile, w, pair)
         _allow(tile, w, limits)
         _judge(w, limits)
         _add(tile, w, votes[t], at)
         _widen(tile, w, pair)
-        by_depth, by_reprojection, by_normal = 0, 0, 0
+        by_depth, by_reprojection, by_normal = np.int32(0), np.int32(0), np.int32(0)
         for m in range(TILE):
             outcome = w[_OUTCOME + m]
-            by_depth += (outcome >= OCCLUDED) & (outcome <= DEPTH)
-            by_reprojection += outcome == REPROJECTION
-            by_normal += outcome == NORMAL
-            bits[t * TILE + m] |= bit if outcome == AGREES else np.uint64(0)
+            by_depth += np.int32((outcome >= occluded) & (outcome <= depth))
+            by_reprojection += np.int32(outcome == reprojection)
+            by_normal += np.int32(outcome == normal)
+        if by_depth + by_reprojection + by_normal < TILE:
+            for m in range(TILE):
+                bits[t * TILE + m] |= bit if w[_OUTCOME + m] == agrees else np.uint64(0)
         failed[0] += by_depth
         failed[1] += by_reprojection
         failed[2] += by_normal
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def differences(
-    tiles: Tiles, other: NDArray[np.float32], pair: NDArray[np.float64], out: NDArray[np.float64]
-) -> int:
+def differences(tiles: Tiles, other: NDArray[np.float32], pair: Pair, out: NDArray[np.float64]) -> int:
     """Fill ``out`` (M, 3) with how much a neighbour differs at those pixels of ``tiles`` that it sees.
 
     The columns are the relative depth error, the reprojection error in pixels, and the angle between
@@ -287,11 +309,10 @@ def differences(
     Returns how many rows were filled.
     """
     height, width, found = other.shape[0], other.shape[1], 0
-    pixels = other.reshape(height * width, other.shape[2])
-    w = np.ones(_SCRATCH)
+    w = np.ones(_SCRATCH, np.float32)
     for t in range(len(tiles)):
         _locate(tiles[t], w, pair, width, height)
-        _fetch(w, pixels)
+        _fetch(w, other)
         _compare(tiles[t], w, pair)
         for m in range(TILE):
             if w[_D + m] > 0.0:
