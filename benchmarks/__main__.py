@@ -78,6 +78,10 @@ TABLES = (
     Table("consensus", "consensus", "consensus.md"),
     Table("calibration", "calibration", "calibration.md"),
     Table("poses", "poses", "poses.md", ("--exact",)),
+    Table("render", "render", "render.md"),
+    Table("fusion", "fusion", "fusion.md"),
+    Table("exports", "exports", "exports.md"),
+    Table("mutations", "mutations", "mutations.md"),
 )  # fmt: skip
 
 

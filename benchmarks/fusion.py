@@ -1,7 +1,8 @@
 """Measure the fusion: depth pixels a second, memory, and how both grow with the number of views.
 
-``python -m benchmarks.fusion`` fuses views of a rippled sphere, 640×480 pixels each, along an arc and prints
-a table; a row is a process of its own, so that its peak of the resident memory is its own.
+``python -m benchmarks.fusion [--views 20 40 80 160] [--output docs/fusion.md]`` fuses views of a rippled
+sphere, 640×480 pixels each, along an arc; a row of the table is a process of its own, so that its peak of the
+resident memory is its own.
 
 What counts as depth pixels: all pixels of all depth maps, each once, however often it is read or compared;
 those that a filter drops and those that an earlier view's points cover are among them. The time is that of
@@ -32,6 +33,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.tables import paragraph, publish, to_file
 from colmap_tco.fusion import FusionConfig, FusionMaps, FusionView, fuse
 from colmap_tco.normals import normals_from_depth
 from colmap_tco.outputs import ViewMaps, read_view, write_image, write_maps
@@ -49,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--views", type=int, nargs="+", default=[10, 20, 40])
+    parser.add_argument("--views", type=int, nargs="+", default=[20, 40, 80, 160])
     parser.add_argument("--size", type=int, nargs=2, default=(640, 480), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--neighbours", type=int, default=10)
     parser.add_argument("--threads", type=int, default=2)
@@ -58,21 +60,38 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--gaps", action="store_true", help="look for gaps, too, of which there are none")
     parser.add_argument("--profile", action="store_true")
     parser.add_argument("--one", action="store_true", help="print the figures of the first number of views")
+    to_file(parser)
     options = parser.parse_args(argv)
     if options.one:
         print(json.dumps(measured(options)))
         return
-    print("| views | neighbours | threads | million depth pixels | points | seconds | CPU seconds | million "
-          "pixels/s | a core | all cores | read | held MB | peak MB |\n" + "|---" * 13 + "|")  # fmt: skip
+    width, height = options.size
+    text = "# The fusion\n\n" + paragraph(
+        f"`python -m benchmarks.fusion`: views of {width}×{height} pixels, {options.neighbours} neighbours "
+        f"each, {options.threads} threads, a cache of {options.cache_size:g} GB. Pixels are those of all "
+        "depth maps, each once, however often it is compared. Per second of the clock; of one core's time; "
+        "and of all cores, were they free, by the seconds of the calling thread and of the others. held: "
+        "maps and images in memory at most."
+    )
+    text += (
+        "\n| views | million depth pixels | points | seconds | CPU seconds | million pixels/s | a core "
+        "| all cores | maps read | held MB | peak MB |\n" + "|---" * 11 + "|\n"
+    )
     for views in options.views:
-        r = in_process(options, views)
-        print(f"| {views} | {options.neighbours} | {options.threads} | {r['pixels'] / 1e6:.2f} "
-              f"| {r['points']:.0f} | {r['seconds']:.2f} | {r['busy']:.2f} "
-              f"| {r['pixels'] / r['seconds'] / 1e6:.2f} | {r['pixels'] / r['busy'] / 1e6:.2f} "
-              f"| {r['pixels'] / (r['serial'] + (r['busy'] - r['serial']) / options.threads) / 1e6:.2f} "
-              f"| {r['loads']:.0f} | {r['held'] / 1e6:.0f} | {r['peak'] / 1e6:.0f} |")  # fmt: skip
+        text += line(in_process(options, views), views, options.threads) + "\n"
+    publish(text, options.output, options.part)
     if options.profile:
         profile(options)
+
+
+def line(r: dict[str, float], views: int, threads: int) -> str:
+    """A row of the table."""
+    free = r["serial"] + (r["busy"] - r["serial"]) / threads
+    pace = " | ".join(f"{r['pixels'] / seconds / 1e6:.2f}" for seconds in (r["seconds"], r["busy"], free))
+    return (
+        f"| {views} | {r['pixels'] / 1e6:.2f} | {r['points']:.0f} | {r['seconds']:.2f} | {r['busy']:.2f} "
+        f"| {pace} | {r['loads']:.0f} | {r['held'] / 1e6:.0f} | {r['peak'] / 1e6:.0f} |"
+    )
 
 
 def in_process(options: argparse.Namespace, views: int) -> dict[str, float]:

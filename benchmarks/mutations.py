@@ -22,6 +22,8 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
+from benchmarks.tables import publish, to_file
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -39,6 +41,8 @@ def _of(file: str, tests: str, *changes: tuple[str, str]) -> list[Mutation]:
     names = tuple(f"tests/tco/test_{name}.py" for name in tests.split())
     return [Mutation(file, old, new, names) for old, new in changes]
 
+
+FUSION = ("tests/colmap_tco/test_fusion_gaps.py", "tests/colmap_tco/test_fusion.py")
 
 MUTATIONS = [
     *_of(
@@ -90,7 +94,8 @@ MUTATIONS = [
         "tco/render/project.py",
         "render",
         ("w.new_tensor([1.0, 1.0, -1.0])", "w.new_tensor([1.0, 1.0, 1.0])"),
-        ("[..., :2] * surfels.scales.unsqueeze(-2)", "[..., :2] * surfels.scales.unsqueeze(-1)[..., :2, :]"),
+        ("surfels.scales.to(exact).unsqueeze(-2)", "surfels.scales.flip(-1).to(exact).unsqueeze(-2)"),
+        ("exact = exact or surfels.means.dtype", "exact = surfels.means.dtype"),
         ("r2 = 2 * torch.log", "r2 = torch.log"),
         ("centres - filtered) - 0.51", "centres - filtered) + 0.51"),
         ("depths > near", "depths > -near"),
@@ -181,8 +186,13 @@ MUTATIONS = [
         ("stages=())", "stages=prediction.stages)"),
     ),
     *(
-        Mutation(file, old, new, ("tests/colmap_tco/test_fusion_gaps.py",))
+        Mutation(file, old, new, FUSION)
         for file, old, new in (
+            ("colmap_tco/_vote_kernels.py", "(ratio if flat else _1) -", "_1 -"),
+            ("colmap_tco/_vote_kernels.py", "x = (tile[COL + m] + _HALF - cx) * ifx * z",
+             "x = (tile[COL + m] - cx) * ifx * z"),
+            ("colmap_tco/_vote_kernels.py", "dx - here_x * dz", "dx + here_x * dz"),
+            ("colmap_tco/_vote_kernels.py", "through if off > _0", "through if off < _0"),
             ("colmap_tco/_fusion_gaps.py", "(depth_error, 0.5)", "(depth_error, 0.0)"),
             ("colmap_tco/_fusion_gaps.py", "(points - centre(view)) @", "(points + centre(view)) @"),
             ("colmap_tco/_fusion_gaps.py", "self._near[j].add(i)", "self._near[j].add(j)"),
@@ -269,6 +279,16 @@ MUTATIONS = [
         ("penalties.depth(every, self.depth, mask, chosen)", "penalties.depth(every, self.depth, mask)"),
     ),
     *_of("tco/options.py", "toy", ("        3e-4,\n", "        1.0,\n")),
+    *_of("tco/options.py", "prefix", ('source_order="uniform", run_ahead=False', 'source_order="uniform"')),
+    *_of("tco/optimize.py", "prefix", ("if self.config.ablation.run_ahead and", "if")),
+    *_of("tco/objective.py", "objective", ("match_exposure(color.detach()", "match_exposure(color")),
+    *_of("tco/backbones/sweep.py", "sweep", ("self.dtype or compute_dtype(", "compute_dtype(")),
+    *_of(
+        "tco/align.py",
+        "align",
+        ("return cls(config.camera_weight, by", "return cls(config.rate, by"),
+        ("*sigmas, kernel=self.kernel)", "*sigmas)"),
+    ),
 ]  # fmt: skip
 
 
@@ -339,7 +359,7 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--only", default="", help="parts of file names, separated by commas")
-    parser.add_argument("--output", type=Path, default=None, help="Markdown file to write, else the terminal")
+    to_file(parser)
     args = parser.parse_args()
     wanted = [word for word in args.only.split(",") if word]
     chosen = [m for m in MUTATIONS if not wanted or any(word in m.file for word in wanted)]
@@ -369,11 +389,7 @@ def main() -> None:
         "| file | from | to | noticed by | by the authors' numbers |\n|---|---|---|---|---|\n"
     )
     text += "\n".join(rows) + "\n"
-    if args.output is None:
-        sys.stdout.write(text)
-    else:
-        args.output.parent.mkdir(parents=True, exist_ok=True)
-        args.output.write_text(text, encoding="utf-8")
+    publish(text, args.output, args.part)
     sys.exit(1 if missed else 0)
 
 

@@ -23,11 +23,11 @@ def test_the_scene_is_two_spheres() -> None:
 
 def test_it_prints_a_row_for_every_number_of_views(capsys: pytest.CaptureFixture[str]) -> None:
     main(["--views", "3", "--size", "64", "48", "--neighbours", "2", "--threads", "1", "--files"])
-    table = capsys.readouterr().out.splitlines()
+    table = [line for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
     cells = [cell.strip() for cell in table[-1].strip("|").split("|")]
     assert len(table) == 3 and len(cells) == table[0].count("|") - 1
-    assert cells[:4] == ["3", "2", "1", "0.01"]
-    assert int(cells[4]) > 100
+    assert cells[:2] == ["3", "0.01"]
+    assert int(cells[2]) > 100
 
 
 def test_maps_in_files_are_the_maps(tmp_path: Path) -> None:
