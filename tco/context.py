@@ -16,7 +16,8 @@ def detached(prediction: Prediction) -> Prediction:
     """The prediction without its history of computation."""
     depth, confidence = prediction.depth.detach(), prediction.confidence.detach()
     stages = tuple(s.detach() for s in prediction.stages)
-    return replace(prediction, depth=depth, confidence=confidence, stages=stages)
+    rays = None if prediction.rays is None else prediction.rays.detach()
+    return replace(prediction, depth=depth, confidence=confidence, stages=stages, rays=rays)
 
 
 def merged(every: Prediction, part: Prediction) -> Prediction:
@@ -26,4 +27,8 @@ def merged(every: Prediction, part: Prediction) -> Prediction:
     stages = tuple(s.clone() for s in every.stages)
     for whole, new in zip(stages, part.stages, strict=True):
         whole[views] = new
-    return replace(every, depth=depth, confidence=confidence, stages=stages)
+    rays = every.rays
+    if rays is not None and part.rays is not None:
+        rays = rays.clone()
+        rays[views] = part.rays
+    return replace(every, depth=depth, confidence=confidence, stages=stages, rays=rays)

@@ -196,6 +196,8 @@ class Prediction(_Movable):
         views: V indices into the chunk, of the views whose depth this is.
         stages: (V, …) tensors that the network wants to find in its next context: what its own stages
             said of these views.
+        rays: (V, H, W, 2) x / z and y / z of each pixel, of networks that predict a point map; None: they
+            are those of the cameras.
     """
 
     depth: Tensor
@@ -203,3 +205,4 @@ class Prediction(_Movable):
     cameras: Cameras
     views: tuple[int, ...]
     stages: tuple[Tensor, ...] = ()
+    rays: Tensor | None = None

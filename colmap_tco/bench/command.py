@@ -201,7 +201,11 @@ def _results(run: _Run, rows: Sequence[Row], progress: Progress) -> dict[str, li
         log.info("%s: %d results are kept, %d are to be made", run.folder, kept_rows, open_rows)
     progress.stage("rows and scenes", open_rows)
     if open_rows:
+        from tco.backbones.pi3 import Pi3
+
         network = load(run.chosen)
+        if isinstance(network, Pi3):
+            network.as_published = run.config.published_settings
         _check_rows(network, rows, _tco(run))
         for scene, left in todo.items():
             for result in _scene(run, network, scene, left):
@@ -341,6 +345,7 @@ def _settings(run: _Run, row: Row, scene: str) -> Mapping[str, Any]:
         "seed": c.seed,
         "row": row.name,
         "priors": list(row.priors),
+        "published_settings": c.published_settings,
         "tco": asdict(row.config(_tco(run))),
     }
 

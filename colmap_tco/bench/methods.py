@@ -127,7 +127,7 @@ def _with_cameras(
     first = optimize(network, views, Priors(), replace(config, steps=0)).prediction
     scaled = rescaled(cameras, first.cameras)
     if not row.surfels or len(views) == 1:  # one view has no other that its surfels could be compared with
-        return _result(Outcome(replace(first, cameras=scaled), scaled))
+        return _result(Outcome(replace(first, cameras=scaled, rays=None), scaled))
     none = views.images.new_zeros(0)
     empty = SparseDepth(none.reshape(0, 2), none, none, none.long())
     alike = torch.ones(len(views), len(views)).fill_diagonal_(0).to(views.images)
@@ -151,10 +151,11 @@ def rescaled(cameras: Cameras, predicted: Cameras) -> Cameras:
 
 
 def _result(outcome: Outcome, unit: float = 1.0) -> Reconstruction:
-    """Points of the depths in the cameras as they are believed at the end."""
+    """Points of the depths in the cameras as they are believed at the end; of a point map, its own."""
     prediction, cameras = outcome.prediction.to("cpu"), outcome.cameras.to("cpu")
     K, poses = cameras.K.double().numpy(), cameras.world_from_cam.double().numpy()
-    points = unproject(prediction.depth.float().numpy(), K, poses) * unit
+    rays = None if prediction.rays is None else prediction.rays.double().numpy()
+    points = unproject(prediction.depth.float().numpy(), K, poses, rays) * unit
     poses[:, :3, 3] *= unit
     loss = outcome.history[-1].get("loss") if outcome.history else None
     return Reconstruction(points, poses, loss)

@@ -65,12 +65,20 @@ class Prepared:
         return unproject(self.depth, self.K, self.world_from_cam)
 
 
-def unproject(depth: NDArray[np.floating], K: Floats, world_from_cam: Floats) -> Floats:
-    """World points (V, H, W, 3) of depth maps (V, H, W), at pixel centres."""
+def unproject(
+    depth: NDArray[np.floating], K: Floats, world_from_cam: Floats, directions: Floats | None = None
+) -> Floats:
+    """World points (V, H, W, 3) of depth maps (V, H, W), at pixel centres.
+
+    ``directions`` (V, H, W, 2) are x / z and y / z of the pixels, by default those of the intrinsics.
+    """
     views, height, width = depth.shape
     centres, found = pixel_centres(width, height), np.empty((views, height, width, 3))
     for i in range(views):
-        local = rays(centres, K[i]) * depth[i].reshape(-1, 1)
+        ray = rays(centres, K[i])
+        if directions is not None:
+            ray = np.concatenate([directions[i].reshape(-1, 2), np.ones_like(ray[:, :1])], 1)
+        local = ray * depth[i].reshape(-1, 1)
         world = local @ world_from_cam[i, :3, :3].T + world_from_cam[i, :3, 3]
         found[i] = world.reshape(height, width, 3)
     return found

@@ -3,7 +3,8 @@
 :class:`Pi3Network` is the published network with the published names; :class:`Pi3` makes it a
 :class:`tco.backbones.base.Backbone`. No view is the reference: world frame and scale are the network's
 own, and only relative poses mean something. Depth is the z of the local point map. The network predicts no
-intrinsics: they are a centred pinhole camera whose focal length is recovered from the local point map.
+intrinsics: they are a centred pinhole camera whose focal length is recovered from the local point map, or, as
+in the published code of TCO, the camera that is fitted to it with a principal point and two focal lengths.
 
 :func:`tco.backbones.compiling.compiled` applies ``torch.compile`` to the blocks.
 """
@@ -19,7 +20,7 @@ from torch import Tensor, nn
 
 from tco.backbones.checkpoints import load_network
 from tco.backbones.dinov2 import COLOR_MEAN, COLOR_STD, PATCH, DINOv2, Patches, ViTConfig, patch_grid
-from tco.backbones.pi3_heads import PixelHead, PoseHead, ViewDecoder, recovered_focal
+from tco.backbones.pi3_heads import PixelHead, PoseHead, ViewDecoder, fitted_intrinsics, recovered_focal
 from tco.backbones.prefix import Passed, first_block
 from tco.backbones.transformer import (
     Block,
@@ -135,9 +136,13 @@ class Pi3(nn.Module):
             recompute: blocks of the decoder whose activations are computed again in the backward
                 pass, for a third more time: with adapters, a view of 518×392 keeps 73 MB a block in
                 float32 without it, 4 MB with it. The attribute can be set at any time.
+
+        The attribute ``as_published``, False at first, makes the cameras those of TCO's code
+        (:func:`tco.backbones.pi3_heads.fitted_intrinsics`).
         """
         super().__init__()
         self.network, self.dtype, self.recompute = network, dtype, recompute
+        self.as_published = False
         store_products(products(network), dtype)
 
     def decoder(self) -> nn.Module:
@@ -173,26 +178,26 @@ class Pi3(nn.Module):
     def decode(
         self, encoded: Patches, views: Sequence[int] | None = None, context: Prediction | None = None
     ) -> Prediction:
-        """Depth and confidence of some views, poses of all.
+        """Depth, rays and confidence of some views, poses of all.
 
-        The focal lengths of the other views are those of the context; without one they are computed
+        The intrinsics of the other views are those of the context; without one they are computed
         here, without gradients.
         """
         chosen = tuple(range(len(encoded))) if views is None else tuple(views)
         tokens = self.tokens(encoded)
         poses = self.poses(tokens, encoded)
         ray, depth, logit = self.maps(tokens, encoded, chosen)
-        focal = {v: f for v, f in zip(chosen, self._focal(ray, logit, encoded, chosen), strict=True)}
-        rest = [v for v in range(len(encoded)) if v not in focal]
+        K = {v: k for v, k in zip(chosen, self._intrinsics(ray, logit, encoded, chosen), strict=True)}
+        rest = [v for v in range(len(encoded)) if v not in K]
         if rest and context is not None:
-            focal.update(zip(rest, context.cameras.K[rest, 0, 0].detach(), strict=True))
+            K.update(zip(rest, context.cameras.K[rest].detach(), strict=True))
         elif rest:
             with torch.no_grad():
                 for v in rest:
                     other, _, weight = self.maps(tokens, encoded, [v])
-                    focal[v] = self._focal(other, weight, encoded, [v])[0]
-        K = centred(torch.stack([focal[v] for v in range(len(encoded))]), encoded.size)
-        return Prediction(depth, 1 + logit.exp(), Cameras(poses, K), chosen)
+                    K[v] = self._intrinsics(other, weight, encoded, [v])[0]
+        cameras = Cameras(poses, torch.stack([K[v] for v in range(len(encoded))]))
+        return Prediction(depth, 1 + logit.exp(), cameras, chosen, rays=ray)
 
     def tokens(self, encoded: Patches) -> Tensor:
         """Tokens (V, registers + P, 2 C) that all heads read."""
@@ -222,9 +227,12 @@ class Pi3(nn.Module):
         with computing(tokens.device, self.dtype):
             return decoder(tokens, turn)[:, c.registers :]
 
-    def _focal(self, ray: Tensor, logit: Tensor, encoded: Patches, views: Sequence[int]) -> Tensor:
-        """Focal lengths (V',), each pixel weighing as much as the network trusts it."""
-        return recovered_focal(ray, logit.detach().sigmoid() * encoded.valid[list(views)])
+    def _intrinsics(self, ray: Tensor, logit: Tensor, encoded: Patches, views: Sequence[int]) -> Tensor:
+        """Intrinsics (V', 3, 3), each pixel weighing as much as the network trusts it; or as published."""
+        if self.as_published:
+            return fitted_intrinsics(ray)
+        focal = recovered_focal(ray, logit.detach().sigmoid() * encoded.valid[list(views)])
+        return centred(focal, encoded.size)
 
 
 def centred(focal: Tensor, size: tuple[int, int]) -> Tensor:

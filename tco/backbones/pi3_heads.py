@@ -116,6 +116,23 @@ def nearest_rotation(M: Tensor) -> Tensor:
     return _NearestRotation.apply(M)
 
 
+def fitted_intrinsics(ray: Tensor) -> Tensor:
+    """Intrinsics (V, 3, 3) by regression of pixels on rays (V, H, W, 2), one for each axis of each view.
+
+    What the code of TCO takes for the cameras of π³ (``estimate_intrinsics_from_local_points``): focal
+    lengths cov(u, x / z) / var(x / z) along either axis, and a principal point that need not be in the
+    middle. Rays that are not exact lessen the focal lengths, unlike in :func:`recovered_focal`. All pixels
+    count alike.
+    """
+    height, width = ray.shape[1:3]
+    u, x = pixel_grid(height, width, ray).reshape(1, -1, 2), ray.flatten(1, 2)
+    middle_u, middle_x = u.mean(1, keepdim=True), x.mean(1, keepdim=True)
+    focal = ((x - middle_x) * (u - middle_u)).mean(1) / (((x - middle_x) ** 2).mean(1) + 1e-8)
+    centre = middle_u[:, 0] - focal * middle_x[:, 0]
+    K = torch.diag_embed(torch.cat([focal, torch.ones_like(focal[:, :1])], -1))
+    return torch.cat([K[..., :2], torch.cat([centre, torch.ones_like(focal[:, :1])], -1)[..., None]], -1)
+
+
 def recovered_focal(ray: Tensor, weight: Tensor) -> Tensor:
     """Focal lengths (V,) in pixels of centred pinhole cameras, from the rays of their pixels.
 

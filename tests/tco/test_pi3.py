@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tco.backbones.base import Backbone
 from tco.backbones.pi3 import Pi3, Pi3Config, Pi3Network, centred
-from tco.backbones.pi3_heads import FOCAL, nearest_rotation, recovered_focal
+from tco.backbones.pi3_heads import FOCAL, fitted_intrinsics, nearest_rotation, recovered_focal
 from tco.geometry import pixel_grid, rays, so3_exp, transform
 from tco.types import Cameras, Prediction, Priors, Views
 from tests.tco.published import (
@@ -193,6 +193,36 @@ def test_rays_of_no_camera_give_a_focal_length_within_bounds() -> None:
         found = recovered_focal(nonsense, torch.ones(1, *size))
         torch.testing.assert_close(found, torch.tensor([bound * unit]))
     assert bool(torch.isfinite(recovered_focal(ray, torch.zeros(1, *size))).all())
+
+
+def test_fitted_intrinsics_are_those_of_any_pinhole_camera() -> None:
+    """Two focal lengths and a principal point off the middle, exactly; and the derivative is one."""
+    K = torch.tensor([[[60.0, 0, 31.5], [0, 75, 14.2], [0, 0, 1]], [[40, 0, 20], [0, 38, 16], [0, 0, 1]]])
+    K = K.double()
+    ray = rays(pixel_grid(28, 42, K).reshape(1, -1, 2), K)[..., :2].reshape(2, 28, 42, 2)
+    torch.testing.assert_close(fitted_intrinsics(ray), K, rtol=1e-5, atol=1e-4)
+    small = ray[:, ::7, ::7].clone().requires_grad_(True)
+    assert torch.autograd.gradcheck(fitted_intrinsics, (small,))
+
+
+def test_as_published_the_cameras_are_fitted_and_points_are_the_point_map(backbone: Pi3) -> None:
+    """Only the intrinsics differ: of all views if all are decoded, else the others' are the context's."""
+    views = some_views()
+    with torch.no_grad():
+        encoded = backbone.encode(views, Priors())
+        plain = backbone.decode(encoded)
+        backbone.as_published = True
+        try:
+            fitted = backbone.decode(encoded)
+            one = backbone.decode(encoded, [1], plain)
+        finally:
+            backbone.as_published = False
+    assert fitted.rays is not None and plain.rays is not None
+    torch.testing.assert_close(fitted.cameras.K, fitted_intrinsics(fitted.rays))
+    for name in ("depth", "rays", "confidence"):
+        assert torch.equal(getattr(plain, name), getattr(fitted, name))
+    assert torch.equal(one.cameras.K[[0, 2]], plain.cameras.K[[0, 2]])
+    torch.testing.assert_close(one.cameras.K[1], fitted.cameras.K[1])
 
 
 def matrices(count: int = 6) -> Tensor:

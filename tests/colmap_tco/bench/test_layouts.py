@@ -9,15 +9,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from colmap_tco.backbones import NetworkConfig
 from colmap_tco.bench.command import BenchConfig, bench
+from colmap_tco.bench.methods import reconstruct
 from colmap_tco.bench.prepare import resized
+from colmap_tco.bench.rows import parse_rows
 from colmap_tco.cli import main
 from colmap_tco.datasets import CHOICES, Choice, open_dataset
 from colmap_tco.progress import Progress
 from tco.backbones.checkpoints import save
+from tco.geometry import transform
 from tco.options import TCOConfig
+from tco.types import Priors
 from tests.colmap_tco.datasets import layouts
 from tests.tco.published import TINY_PI3, TINY_VGGT, tiny_pi3, tiny_vggt
 
@@ -120,3 +125,29 @@ def test_the_command_ends_with_6_where_scenes_have_no_figures(
     assert main([*words, "--scenes", "kitchen"]) == 0
     assert "| base |" in capsys.readouterr().out
     assert main([*words, "--scenes", "attic"]) == 3
+
+
+def test_points_of_pi3_are_its_own_point_map(tmp_path: Path) -> None:
+    """Whatever camera would fit it; in the prior cameras, its depths are along their rays."""
+    layouts.nrgbd(tmp_path)
+    reader = open_dataset("nrgbd", tmp_path)
+    (scene,) = reader.scenes()
+    prepared, network = resized(reader.read(scene, range(3)), 56, 14), tiny_pi3()
+    made = {
+        row.name: reconstruct(network, prepared, row, TCOConfig(), torch.device("cpu"))
+        for row in parse_rows(["base", "raw-depth"], ("pose", "intrinsics"))
+    }
+    with torch.no_grad():
+        encoded = network.encode(prepared.views, Priors())
+        tokens = network.tokens(encoded)
+        ray, depth, _ = network.maps(tokens, encoded, range(3))
+        pose = network.poses(tokens, encoded)
+    local = torch.cat([ray, torch.ones_like(ray[..., :1])], -1) * depth[..., None]
+    world = transform(pose, local.flatten(1, 2)).view_as(local)
+    np.testing.assert_allclose(made["base"].points, world.numpy(), rtol=1e-4, atol=1e-4)
+    poses = made["raw-depth"].world_from_cam
+    centres = made["raw-depth"].points - poses[:, None, None, :3, 3]
+    seen = np.einsum("vhwc,vcd->vhwd", centres, poses[:, :3, :3])
+    np.testing.assert_allclose(seen[..., 2], depth.numpy(), rtol=1e-4)
+    u = (np.arange(56) + 0.5 - prepared.K[0, 0, 2]) / prepared.K[0, 0, 0]
+    np.testing.assert_allclose(seen[0, 0, :, 0] / seen[0, 0, :, 2], u, rtol=1e-4, atol=1e-5)
