@@ -81,6 +81,8 @@ TABLES = (
     Table("render", "render", "render.md"),
     Table("fusion", "fusion", "fusion.md"),
     Table("exports", "exports", "exports.md"),
+    Table("fill", "fill", "outputs.md", ("kitchen",)),
+    Table("many", "many", "many.md", ("runs/many",)),
     Table("mutations", "mutations", "mutations.md"),
 )  # fmt: skip
 

@@ -1,6 +1,6 @@
 """``densify --fill_only`` on a real PatchMatch result: the two alone and together, scored against the sensor.
 
-    python -m benchmarks.fill kitchen --work runs/fill
+    python -m benchmarks.fill kitchen --work runs/fill [--output docs/outputs.md]
 
 COLMAP's PatchMatch needs CUDA. Here its place is taken by the one of pyarchinit-photogrammetry-core (PyPI;
 ``--no-deps`` is enough), at half resolution, on the images and cameras that COLMAP's ``image_undistorter``
@@ -23,7 +23,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.quality import SETS, copied, row, run, scored, source
+from benchmarks.quality import COLUMNS, SETS, copied, run, scored, source
+from benchmarks.tables import paragraph, publish, to_file
 from colmap_tco import _pycolmap
 from colmap_tco.export.dense import DenseView, open_dense
 from colmap_tco.maps import map_intrinsics, write_map
@@ -149,11 +150,18 @@ def _points_of(model: Any, view: DenseView) -> Floats:
     return xyz[[place[p] for p in _pycolmap.observations(model, view.image_id)[1].tolist()]]
 
 
+def line(what: str, figures: Mapping[str, float]) -> str:
+    """A row of the table."""
+    cells = " | ".join(f"{figures[c]:.4g}" if figures.get(c) is not None else "" for c in COLUMNS)
+    return f"| {what} | {cells} |\n"
+
+
 def main() -> None:
     """Command line; other options are handed to densify."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("set", choices=SETS)
     parser.add_argument("--work", type=Path, default=Path("runs/fill"))
+    to_file(parser)
     args, rest = parser.parse_known_args()
     if importlib.util.find_spec("ppg_core") is None:
         sys.exit("this needs a PatchMatch: pip install --no-deps pyarchinit-photogrammetry-core==0.5.0")
@@ -165,17 +173,23 @@ def main() -> None:
         make_patchmatch(root, making)
         making.rename(dense)
     truth, count = source(args.set, args.work), len(list((root / "images").iterdir()))
-    out = sys.stdout
-    figures, peak = scored(truth, "--dense", str(dense))
-    out.write(row(args.set, "PatchMatch", figures, figures["seconds"], peak, count) + "\n")
+    figures, _ = scored(truth, "--dense", str(dense))
+    text = paragraph(
+        f"`{args.set}`, {count} views (`python -m benchmarks.fill {args.set}`): PatchMatch of "
+        "pyarchinit-photogrammetry-core at half resolution on COLMAP's undistorted images, filtered as "
+        "COLMAP does (two views within a pixel), against the sensor; columns as in `docs/quality.md`. f5 and "
+        "points are of the cloud, for PatchMatch of the pixels of all maps where the sensor measured."
+    )
+    text += f"\n| | {' | '.join(COLUMNS)} |\n" + "|---" * (len(COLUMNS) + 1) + "|\n"
+    text += line("PatchMatch", figures)
     for what, more in (("network and optimisation", []), ("--fill_only", ["--fill_only", str(dense)])):
         command = [sys.executable, "-m", "colmap_tco", "densify", str(root), "--overwrite", *more, *rest]
-        done = run(command)
+        run(command)
         kept = args.work / f"{args.set}{'-filled' if more else '-alone'}"
         shutil.rmtree(kept, ignore_errors=True)
         shutil.copytree(root / "dense-tco", kept)
-        figures = scored(truth, "--dense", str(kept))[0]
-        out.write(row(args.set, what, figures, done.seconds, done.peak, count) + "\n")
+        text += line(what, scored(truth, "--dense", str(kept))[0])
+    publish(text, args.output, args.part)
 
 
 if __name__ == "__main__":

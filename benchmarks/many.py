@@ -1,6 +1,6 @@
 """What a survey of many pictures costs: seconds of every stage and memory, for a growing number of views.
 
-    python -m benchmarks.many runs/many [--views 15 60 200] [--steps 0] [--max_image_size 384]
+    python -m benchmarks.many runs/many [--views 15 60 200] [--steps 0] [--output docs/many.md]
 
 The pictures are of a flight over the ``hills`` of ``benchmarks/rendered.py``, in lines as a drone flies them,
 with the same distance between pictures whatever their number. The model has the true cameras; its points are
@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.rendered import hills, traced
+from benchmarks.tables import paragraph, publish, to_file
 from colmap_tco import _pycolmap
 from colmap_tco.progress import Progress
 from training.paths import look_at
@@ -200,11 +201,18 @@ def main() -> None:
     parser.add_argument("--steps", type=int, help="of the optimisation; default: densify's own")
     parser.add_argument("--max_image_size", type=int, default=0, help="as of densify")
     parser.add_argument("--one", type=Path, help="measure this workspace in this process, and print JSON")
+    to_file(parser)
     args = parser.parse_args()
     if args.one:
         sys.stdout.write(json.dumps(run_here(args.one, args.steps, args.max_image_size)) + "\n")
         return
-    sys.stdout.write(header() + "\n")
+    text = "# Many views\n\n" + paragraph(
+        "`python -m benchmarks.many FOLDER` renders a flight over hills, "
+        f"{SHAPE[1]}×{SHAPE[0]} pixels a picture, and densifies it; settings are the defaults where no option "
+        "says otherwise. Seconds are of the processor, over all threads; two cores take little more than half "
+        "of them. The compiled loops were there already."
+    )
+    text += "\n" + header() + "\n"
     options = [] if args.steps is None else ["--steps", str(args.steps)]
     for views in args.views:
         root = made(args.folder.resolve(), views)
@@ -213,8 +221,8 @@ def main() -> None:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             raise SystemExit(f"{' '.join(command)} failed:\n{done.stderr}")
-        sys.stdout.write(row(views, json.loads(done.stdout.splitlines()[-1])) + "\n")
-        sys.stdout.flush()
+        text += row(views, json.loads(done.stdout.splitlines()[-1])) + "\n"
+    publish(text, args.output, args.part)
 
 
 if __name__ == "__main__":
