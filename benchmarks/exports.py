@@ -196,13 +196,18 @@ def lines(made: Made) -> Iterator[str]:
         yield f"| {name} | {len(made.points)} → {count} | {said} |"
 
 
-def main() -> None:
-    """Measure and publish."""
+def parser() -> argparse.ArgumentParser:
+    """Command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--set", default="kitchen")
     parser.add_argument("--work", type=Path, default=Path("runs/exports"))
     to_file(parser)
-    args = parser.parse_args()
+    return parser
+
+
+def main() -> None:
+    """Measure and publish."""
+    args = parser().parse_args()
     workspace = copied(args.set, args.work)
     command("densify", workspace, "--overwrite")
     dense = open_dense(workspace)

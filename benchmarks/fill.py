@@ -156,13 +156,18 @@ def line(what: str, figures: Mapping[str, float]) -> str:
     return f"| {what} | {cells} |\n"
 
 
-def main() -> None:
-    """Command line; other options are handed to densify."""
+def parser() -> argparse.ArgumentParser:
+    """Command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("set", choices=SETS)
     parser.add_argument("--work", type=Path, default=Path("runs/fill"))
     to_file(parser)
-    args, rest = parser.parse_known_args()
+    return parser
+
+
+def main() -> None:
+    """Command line; other options are handed to densify."""
+    args, rest = parser().parse_known_args()
     if importlib.util.find_spec("ppg_core") is None:
         sys.exit("this needs a PatchMatch: pip install --no-deps pyarchinit-photogrammetry-core==0.5.0")
     args.work.mkdir(parents=True, exist_ok=True)

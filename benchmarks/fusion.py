@@ -46,7 +46,7 @@ DISTANCE, STEP = 4.0, 0.06
 """Distance of the cameras from the middle of the sphere, and radians between two of them."""
 
 
-def main(argv: Sequence[str] | None = None) -> None:
+def parser() -> argparse.ArgumentParser:
     """Command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -61,7 +61,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--profile", action="store_true")
     parser.add_argument("--one", action="store_true", help="print the figures of the first number of views")
     to_file(parser)
-    options = parser.parse_args(argv)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Command line."""
+    options = parser().parse_args(argv)
     if options.one:
         print(json.dumps(measured(options)))
         return

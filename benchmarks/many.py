@@ -191,7 +191,7 @@ def header() -> str:
     return "| " + " | ".join(cells) + " |\n" + "|---" * len(cells) + "|"
 
 
-def main() -> None:
+def parser() -> argparse.ArgumentParser:
     """Command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -202,15 +202,20 @@ def main() -> None:
     parser.add_argument("--max_image_size", type=int, default=0, help="as of densify")
     parser.add_argument("--one", type=Path, help="measure this workspace in this process, and print JSON")
     to_file(parser)
-    args = parser.parse_args()
+    return parser
+
+
+def main() -> None:
+    """Command line."""
+    args = parser().parse_args()
     if args.one:
         sys.stdout.write(json.dumps(run_here(args.one, args.steps, args.max_image_size)) + "\n")
         return
     text = "# Many views\n\n" + paragraph(
         "`python -m benchmarks.many FOLDER` renders a flight over hills, "
-        f"{SHAPE[1]}×{SHAPE[0]} pixels a picture, and densifies it; settings are the defaults where no option "
-        "says otherwise. Seconds are of the processor, over all threads; two cores take little more than half "
-        "of them. The compiled loops were there already."
+        f"{SHAPE[1]}×{SHAPE[0]} pixels a picture, and densifies it, with the defaults where no option says "
+        "otherwise. Seconds are of the processor, over all threads; two cores take little more than half of "
+        "them. The compiled loops were there already."
     )
     text += "\n" + header() + "\n"
     options = [] if args.steps is None else ["--steps", str(args.steps)]

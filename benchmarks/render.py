@@ -121,13 +121,18 @@ def growth(threads: int, repeat: int) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main() -> None:
-    """Measure and publish."""
+def parser() -> argparse.ArgumentParser:
+    """Command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--repeat", type=int, default=5)
     to_file(parser)
-    args = parser.parse_args()
+    return parser
+
+
+def main() -> None:
+    """Measure and publish."""
+    args = parser().parse_args()
     text = "# The renderer\n\n" + paragraph(
         f"`python -m benchmarks.render`: a source of 320×240, 76,800 surfels, into {VIEWS} views of that "
         f"size, with the gradients by depth, confidence, poses and intrinsics; the best of {args.repeat} "
