@@ -31,7 +31,7 @@ from colmap_tco.workspace import DensePaths, read_image
 JPEG_QUALITY = 95
 COLOUR_DETAIL = 4
 _DIGITS, _ALL_DIGITS = 6, 17
-_FEWEST_POINTS, _NEARLY_ALL = 10, 0.98
+FEWEST_POINTS, NEARLY_ALL = 10, 0.98
 """Points of a view below which their depths bound nothing, and the share that shall lie before the bound."""
 
 
@@ -252,8 +252,8 @@ def reaches(tracks: Tracks, views: Sequence[View]) -> dict[str, float]:
     for view in views:
         xyz = tracks.xyz[tracks.images[view.image_id].point]
         depth = xyz @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3]
-        if len(depth) >= _FEWEST_POINTS:
-            found[view.name] = float(np.quantile(depth, _NEARLY_ALL))
+        if len(depth) >= FEWEST_POINTS:
+            found[view.name] = float(np.quantile(depth, NEARLY_ALL))
     return found
 
 

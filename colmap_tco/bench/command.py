@@ -312,7 +312,7 @@ def _row(run: _Run, network: Backbone, scene: str, prepared: Any, row: Row) -> R
             figures = pose_figures(made.world_from_cam, prepared.world_from_cam)
         else:
             per_metre = UNITS.get(run.config.dataset, 1.0)
-            figures = point_figures(made.points, prepared.points, prepared.known, per_metre)
+            figures = point_figures(made.points, prepared.points, prepared.known, per_metre, made.kept)
     except (InputError, ValueError) as error:
         log.warning("%s, %s: %s", row.name, scene, error)
         return Result(row.name, scene, {}, seconds, views, str(error))

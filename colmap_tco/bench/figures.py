@@ -35,7 +35,11 @@ COLUMNS = {name: tuple(POSES if name == "scannet" else POINTS) for name in
 
 
 def point_figures(
-    points: Floats, truth: Floats, known: NDArray[np.bool_], per_metre: float = 1.0
+    points: Floats,
+    truth: Floats,
+    known: NDArray[np.bool_],
+    per_metre: float = 1.0,
+    kept: NDArray[np.bool_] | None = None,
 ) -> dict[str, float]:
     """Accuracy, completion and normal consistency as the paper has them.
 
@@ -47,15 +51,17 @@ def point_figures(
         truth: (V, H, W, 3), metres.
         known: (V, H, W), where the truth is.
         per_metre: units of the result per metre.
+        kept: (V, H, W), pixels whose points are there; None: all. All true points are to be found.
 
     Raises:
         InputError: too few true points, or points that cannot be aligned to them.
     """
-    ours, theirs = points[known], truth[known]
+    both = known if kept is None else known & kept
+    ours, theirs = points[both], truth[known]
     if len(ours) < 3:
         raise InputError(f"{len(ours)} pixels of these frames have a true depth: there is nothing to compare")
     try:
-        similarity = umeyama(ours, theirs)
+        similarity = umeyama(ours, truth[both])
     except ValueError as error:
         raise InputError(f"the points cannot be aligned to the truth: {error}") from error
     aligned = similarity.apply(ours)

@@ -5,13 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from colmap_tco.bench.prepare import Prepared, unproject
 from colmap_tco.bench.rows import Row
 from colmap_tco.datasets.base import Floats
 from colmap_tco.errors import InputError
+from colmap_tco.fusion_config import FusionConfig
+from colmap_tco.outputs import FEWEST_POINTS, NEARLY_ALL
 from tco.align import CameraPenalties, KnownCameras
 from tco.backbones.base import Backbone
 from tco.lora import select
@@ -32,11 +36,16 @@ class Reconstruction:
         points: (V, H, W, 3), in the frame and unit of the network or of the prior cameras.
         world_from_cam: (V, 4, 4), likewise.
         loss: of the last step; None without steps.
+        kept: (V, H, W), the pixels whose points count; None: all. With sparse points among the priors
+            those that are too deep are left out, as the fusion leaves them out of clouds
+            (``max_depth_ratio``): a few in a thousand that are taken for sky would decide the alignment, a
+            sum of squares.
     """
 
     points: Floats
     world_from_cam: Floats
     loss: float | None
+    kept: NDArray[np.bool_] | None = None
 
 
 def check_row(network: Backbone, row: Row) -> None:
@@ -98,7 +107,8 @@ def reconstruct(
     if network.uses_cameras:
         assert scene.priors is not None
         priors = row.noise(scene.priors, seed).to(device)
-        return _result(optimize(backbone, views, priors, config, seed), scene.unit)
+        outcome = optimize(backbone, views, priors, config, seed)
+        return replace(_result(outcome, scene.unit), kept=_near(outcome, scene.priors))
     if row.cameras:
         return _with_cameras(backbone, views, cameras.to(device), row, config, seed)
     priors = held_priors(scene, cameras, row).to(device) if config.steps else Priors()
@@ -159,6 +169,18 @@ def _result(outcome: Outcome, unit: float = 1.0) -> Reconstruction:
     poses[:, :3, 3] *= unit
     loss = outcome.history[-1].get("loss") if outcome.history else None
     return Reconstruction(points, poses, loss)
+
+
+def _near(outcome: Outcome, priors: Priors) -> NDArray[np.bool_]:
+    """Pixels (V, H, W) that are no deeper than the fusion takes them, by the points of their view."""
+    assert priors.sparse is not None
+    most = FusionConfig().max_depth_ratio
+    bounds = [
+        most * float(points.depth.quantile(NEARLY_ALL)) if len(points) >= FEWEST_POINTS else np.inf
+        for points in priors.sparse
+    ]
+    depth = outcome.prediction.depth.float().cpu().numpy()
+    return np.asarray(depth <= np.array(bounds, np.float32)[:, None, None])
 
 
 class _WithHeads(nn.Module):

@@ -67,6 +67,19 @@ def test_points_that_differ_by_a_similarity_have_no_error(tmp_path: Path) -> Non
         point_figures(moved, prepared.points, np.zeros_like(prepared.known))
 
 
+def test_points_that_are_left_out_do_not_move_the_others_and_are_missed(tmp_path: Path) -> None:
+    """A hundredth of the pixels, thirty times too far: they decide the alignment unless they are left out."""
+    layouts.nrgbd(tmp_path)
+    prepared = resized(NRGBD(tmp_path).read("kitchen", [0, 1, 2]), 56, 14)
+    points, far = prepared.points.copy(), np.zeros_like(prepared.known)
+    far[:, ::10, ::10] = True
+    points[far] *= 30
+    spoilt = point_figures(points, prepared.points, prepared.known)
+    found = point_figures(points, prepared.points, prepared.known, kept=~far)
+    assert found["acc_mean"] < 1e-6 and spoilt["comp_mean"] > 0.05
+    assert 0 < found["comp_mean"] < 0.01, "the true points there have no point of ours at their place"
+
+
 def test_poses_that_differ_by_a_similarity_have_no_error() -> None:
     poses = np.stack(layouts.poses(6))
     R = so3_exp(torch.tensor([0.3, -0.5, 0.2], dtype=torch.float64)).numpy()
