@@ -11,21 +11,14 @@ from typing import TYPE_CHECKING, Any
 from colmap_tco._pycolmap import Camera, registered
 from colmap_tco.backbones import NetworkConfig, Selected, choose_device, needed, select
 from colmap_tco.errors import InputError, MissingError
+from colmap_tco.image_files import decoded_size, list_images
 from colmap_tco.memory import FEWEST_VIEWS, SHARE, chunk_limit, free_memory
 from colmap_tco.pinhole import Pinhole, undistorted_camera
 from colmap_tco.progress import Progress
 from colmap_tco.published import NETWORKS, Network
 from colmap_tco.views import ViewConfig, network_size
 from colmap_tco.weights import accepted, cached, gigabytes
-from colmap_tco.workspace import (
-    WorkspaceConfig,
-    choose_model,
-    decoded_size,
-    existing_root,
-    find_images,
-    find_models,
-    list_images,
-)
+from colmap_tco.workspace import WorkspaceConfig, choose_model, existing_root, find_images, find_models
 from tco.options import TCOConfig
 
 if TYPE_CHECKING:
@@ -103,7 +96,7 @@ def check(root: Path, config: CheckConfig, progress: Progress) -> Checked:
     """Look at the machine and the workspace; nothing is written and no network is loaded.
 
     Raises:
-        InputError: the workspace has no pictures.
+        InputError: the workspace has no pictures, or one alone and no model.
         MissingError: no such device.
     """
     progress.stage("check", 1)
@@ -147,6 +140,8 @@ def _cameras(root: Path, config: WorkspaceConfig) -> tuple[list[Pinhole], str]:
         found.append(Pinhole(width, height, width, width, width / 2, height / 2))
     if not found:
         raise InputError(f"{folder}: no picture in it can be decoded")
+    if len(found) < 2:
+        raise InputError(f"{folder}: one picture; densify needs at least two, and three or more to map them")
     return found, f"{len(found)} images in {folder}, which densify would map first"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import importlib
 import json
 import logging
@@ -18,7 +19,14 @@ from typing import Any, NoReturn
 
 from colmap_tco import flags
 from colmap_tco.commands import COMMANDS, Command
-from colmap_tco.errors import DensifyError, OutOfMemoryError, UsageError, is_out_of_memory
+from colmap_tco.errors import (
+    DensifyError,
+    InputError,
+    OutOfMemoryError,
+    PartlyDoneError,
+    UsageError,
+    is_out_of_memory,
+)
 from colmap_tco.kernel_cache import ensure_kernel_cache
 from colmap_tco.progress import Progress
 
@@ -73,10 +81,16 @@ waits for threads to wake; with many, a busy one waits for threads that only wai
 environment takes others, to compare."""
 
 
+UNWRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT)
+"""Errors of the system that the user can do something about."""
+
+
 def exit_code(error: BaseException) -> int:
     """The exit code that tells a script what kind of failure ``error`` is."""
     if isinstance(error, DensifyError):
         return error.exit_code
+    if isinstance(error, OSError) and error.errno in UNWRITABLE and error.filename:
+        return InputError.exit_code
     if isinstance(error, KeyboardInterrupt):
         return INTERRUPTED
     return OutOfMemoryError.exit_code if is_out_of_memory(error) else 1
@@ -145,7 +159,8 @@ class _Outcome:
         self.exit_code = exit_code(error)
         # A mistyped flag needs no traceback.
         traceback = error if self.show_traceback and not isinstance(error, UsageError) else None
-        logger.error(
+        logger.log(
+            logging.WARNING if isinstance(error, PartlyDoneError) else logging.ERROR,
             _sentence(error, self.exit_code),
             exc_info=traceback,
             extra={"data": {"exit_code": self.exit_code}},
@@ -156,6 +171,11 @@ class _Outcome:
 def _sentence(error: BaseException, code: int) -> str:
     if isinstance(error, DensifyError):
         return str(error)
+    if isinstance(error, OSError) and error.errno in UNWRITABLE and error.filename:
+        return (
+            f"{error.filename}: it cannot be written ({error.strerror}); change that, or name another place "
+            "with --output_path where the command has it"
+        )
     if isinstance(error, _Terminated):
         return "stopped by SIGTERM"
     if code == INTERRUPTED:

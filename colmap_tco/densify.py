@@ -163,6 +163,7 @@ def _densify(root: Path, config: DensifyConfig, bare: bool, progress: Progress) 
     with clock("workspace"):
         workspace = open_workspace(root, config.workspace, config.num_threads)
         views, skipped = make_views(workspace, config.views, chosen.network.stride, chosen.network.image_size)
+        _tell_size(views, config.views)
         tracks = read_tracks(workspace.model, logging.INFO)
         if config.priors.pose_covariance:
             tracks = with_deviations(tracks, workspace.model)
@@ -202,6 +203,18 @@ def _densify(root: Path, config: DensifyConfig, bare: bool, progress: Progress) 
         write_page(result.paths, json.loads(result.paths.report.read_text("utf-8")))
     folder = result.publish().root
     return Densified(folder, json.loads((folder / "report.json").read_text("utf-8")), fresh=True)
+
+
+def _tell_size(views: Sequence[View], config: ViewConfig) -> None:
+    """Say how large the maps get, and how to change that."""
+    largest = max(views, key=lambda view: view.network.width * view.network.height)
+    small, full = largest.network, largest.camera
+    log.info(
+        "depth maps of %d×%d pixels, from pictures of %d×%d (--max_image_size: more, for time and memory "
+        "with its square)", small.width, small.height, full.width, full.height,
+    )  # fmt: skip
+    if config.max_image_size > max(full.width, full.height):
+        log.warning("--max_image_size %d is more than the pictures have", config.max_image_size)
 
 
 def _finished(result: Result) -> Densified:

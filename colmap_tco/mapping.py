@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from colmap_tco import _pycolmap
 from colmap_tco._pycolmap import Ints
 from colmap_tco.errors import InputError, MissingError
+from colmap_tco.image_files import decoded_size, list_images
 from colmap_tco.progress import Progress
-from colmap_tco.workspace import decoded_size, existing_root, find_images, find_models, list_images, listing
+from colmap_tco.workspace import existing_root, find_images, find_models, listing
 from tco.config import check_range, knob
 
 log = logging.getLogger(__name__)
@@ -187,9 +188,12 @@ def _reconstruct(job: _Job, config: MappingConfig, progress: Progress) -> None:
 
     use_global = config.mapper == "global"
     if not _pycolmap.run_mapper(inputs, output, use_global, job.threads, job.seed, registered):
+        all_pairs = _choose_matcher(config.matcher, len(job.names)) == "exhaustive"
+        more = "" if all_pairs else "; --matcher exhaustive tries all pairs"
+        few = " Two or three are often too few." if len(job.names) <= 3 else ""
         raise InputError(
             f"{job.folder}: COLMAP found no reconstruction in {len(job.names)} images. They need texture, "
-            "much overlap, and a camera that moves sideways; --matcher exhaustive tries all pairs."
+            f"much overlap, and a camera that moves sideways{more}.{few}"
         )
 
 

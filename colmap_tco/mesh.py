@@ -22,10 +22,10 @@ from colmap_tco.atomic import atomic_path
 from colmap_tco.errors import InputError
 from colmap_tco.export.dense import Dense, DenseView, open_dense
 from colmap_tco.export.las import spacing
+from colmap_tco.image_files import read_image
 from colmap_tco.maps import map_intrinsics, read_map
 from colmap_tco.ply import Cloud
 from colmap_tco.progress import Progress
-from colmap_tco.workspace import read_image
 from tco.config import knob
 
 if TYPE_CHECKING:

@@ -21,12 +21,13 @@ from colmap_tco._pycolmap import Model
 from colmap_tco.atomic import UNFINISHED, atomic_file, write_text
 from colmap_tco.errors import DensifyError
 from colmap_tco.fusion_input import FusionMaps, FusionView
+from colmap_tco.image_files import read_image
 from colmap_tco.maps import read_map, write_map
 from colmap_tco.ply import Cloud, needs_double, write_ply, write_vis
 from colmap_tco.sparse_format import reorder_images
 from colmap_tco.tracks import Tracks
 from colmap_tco.views import View, map_mask, undistorted_image
-from colmap_tco.workspace import DensePaths, read_image
+from colmap_tco.workspace import DensePaths
 
 JPEG_QUALITY = 95
 COLOUR_DETAIL = 4

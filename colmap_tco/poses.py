@@ -18,11 +18,12 @@ from colmap_tco import report
 from colmap_tco.backbones import NetworkConfig
 from colmap_tco.depth_views import Depth, find_depths, on_canvas, read_depths
 from colmap_tco.errors import InputError
+from colmap_tco.image_files import list_images
 from colmap_tco.pose_outputs import OURS, Found, write
 from colmap_tco.progress import Progress
 from colmap_tco.rough import Rough, RoughConfig, read_rough, scale_of
 from colmap_tco.views import ChunkFrame, View, ViewConfig, batch, canvas_size, make_views
-from colmap_tco.workspace import Workspace, check_images, list_images, listing
+from colmap_tco.workspace import Workspace, check_images, listing
 from tco.config import knob
 from tco.pose_options import PoseConfig
 

@@ -184,7 +184,7 @@ class Viewer:
         """One frustum a view; a click on it looks through the camera."""
         import numpy as np
 
-        from colmap_tco.workspace import read_image
+        from colmap_tco.image_files import read_image
 
         views, server = self.scene.views, self.server
         centres = np.array([-v.cam_from_world[:, :3].T @ v.cam_from_world[:, 3] for v in views])

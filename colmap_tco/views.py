@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 from colmap_tco import _pycolmap
 from colmap_tco._pycolmap import Camera, Floats, Mask, Registered
 from colmap_tco.errors import InputError
+from colmap_tco.image_files import read_image
 from colmap_tco.pinhole import CELL, Pinhole, trusted_cells, undistorted_camera
-from colmap_tco.workspace import Workspace, listing, read_image
+from colmap_tco.workspace import Workspace, listing
 from tco.config import check_range, knob
 
 if TYPE_CHECKING:
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _Map = TypeVar("_Map", bound=Any)
-
 _BAND = 256
 
 

@@ -10,17 +10,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from colmap_tco import _pycolmap, model_files
 from colmap_tco._pycolmap import Model, Registered
 from colmap_tco.errors import InputError
+from colmap_tco.image_files import PICTURES, decoded_size, list_images, other_formats
 from tco.config import knob
 
 log = logging.getLogger(__name__)
 
-PICTURES = frozenset([".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".jp2", ".pgm", ".ppm"])
 LISTED = 10
 """How many names an error message lists before it says how many more there are."""
 
@@ -205,13 +202,19 @@ def unregistered_images(
         names: of the registered images.
         elsewhere: name → another model of the workspace that has it.
     """
-    left = sorted(set(list_images(folder, recursive=folder != root)) - set(names))
-    return {
-        name: f"COLMAP registered it in {elsewhere[name]}, not in the model that was chosen"
-        if name in elsewhere
-        else "COLMAP did not register it: too few matches with the images of the model"
-        for name in left
-    }
+    recursive = folder != root
+    left = sorted(set(list_images(folder, recursive)) - set(names))
+    return other_formats(folder, recursive) | {name: _why_not(folder, name, elsewhere) for name in left}
+
+
+def _why_not(folder: Path, name: str, elsewhere: Mapping[str, Path]) -> str:
+    if name in elsewhere:
+        return f"COLMAP registered it in {elsewhere[name]}, not in the model that was chosen"
+    try:
+        decoded_size(folder / name)
+    except InputError as error:
+        return str(error)
+    return "COLMAP did not register it: too few matches with the images of the model"
 
 
 def existing_root(root: Path | str) -> Path:
@@ -230,13 +233,6 @@ def listing(reasons: Mapping[str, str]) -> str:
     """Some of the reasons, one a line, for a message."""
     lines = [f"  {name}: {reason}" for name, reason in list(reasons.items())[:LISTED]]
     return "\n".join(lines + [f"  … and {len(reasons) - LISTED} more"] * (len(reasons) > LISTED))
-
-
-def list_images(folder: Path, recursive: bool = True) -> list[str]:
-    """Names of the pictures below a folder, relative to it, with forward slashes, sorted."""
-    files = folder.rglob("*") if recursive else folder.iterdir()
-    names = (path.relative_to(folder) for path in files if path.suffix.lower() in PICTURES and path.is_file())
-    return sorted(name.as_posix() for name in names if not any(part.startswith(".") for part in name.parts))
 
 
 def find_images(root: Path, image_path: str = "", wanted: Sequence[str] = ()) -> Path:
@@ -262,9 +258,11 @@ def find_images(root: Path, image_path: str = "", wanted: Sequence[str] = ()) ->
     if wanted and any((root / name).is_file() for name in wanted):
         return root
     if not candidates:
+        foreign = other_formats(root)
         raise InputError(
             f"{root}: no pictures in {root / 'images'} nor in the folder itself "
             f"({', '.join(sorted(PICTURES))}); name their folder with --image_path"
+            + (f", or convert those that are there to JPEG:\n{listing(foreign)}" if foreign else "")
         )
     return candidates[0]
 
@@ -366,35 +364,3 @@ def _image_fault(path: Path, entry: Registered) -> str:
         hint = "rotated after mapping" if size == expected[::-1] else "resized or replaced after mapping"
         return f"{size[0]}×{size[1]} pixels where its camera has {expected[0]}×{expected[1]}: {hint}?"
     return ""
-
-
-def decoded_size(path: Path) -> tuple[int, int]:
-    """(width, height) as stored, after reading the file to its end.
-
-    Raises:
-        InputError: truncated, or no picture that can be read.
-    """
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as image:
-            size = image.size
-            image.draft("RGB", (image.width // 8, image.height // 8))
-            image.load()
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
-        raise InputError(f"{path}: cannot be decoded ({error}); copy it again or convert it") from error
-    return size
-
-
-def read_image(path: Path) -> NDArray[np.uint8]:
-    """RGB (H, W, 3), pixels as stored: EXIF orientation ignored, as COLMAP does.
-
-    Raises:
-        InputError: the file is missing or cannot be decoded.
-    """
-    import cv2
-
-    bgr = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if bgr is None:
-        raise InputError(f"{path}: missing or not a picture that can be decoded; convert it to JPEG or PNG")
-    return np.ascontiguousarray(bgr[..., ::-1])

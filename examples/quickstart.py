@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from colmap_tco.densify import DensifyConfig, densify
-from colmap_tco.errors import PartlyDoneError
+from colmap_tco.errors import DensifyError, PartlyDoneError
 from colmap_tco.maps import read_map
 from colmap_tco.ply import read_ply
 from colmap_tco.views import ViewConfig
@@ -29,8 +29,10 @@ def main() -> None:
     """Densify, then look at the cloud, at one depth map and at the report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("workspace", type=Path)
-    parser.add_argument("--size", type=int, default=256, help="longer side of the network's pictures")
-    parser.add_argument("--steps", type=int, default=10, help="of the optimisation; 0: the network alone")
+    parser.add_argument(
+        "--size", type=int, default=0, help="longer side of the network's pictures; 0: its own"
+    )
+    parser.add_argument("--steps", type=int, default=TCOConfig().steps, help="0: the network alone")
     args = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
 
@@ -40,6 +42,8 @@ def main() -> None:
         densify(args.workspace, config)
     except PartlyDoneError as error:  # everything is written; some images had to be left out
         print(error)
+    except DensifyError as error:  # the message says what to do about it
+        raise SystemExit(str(error)) from error
 
     paths = dense_paths(args.workspace)  # workspace/dense-tco, a dense workspace as COLMAP has it
     points, normals, colors = read_ply(paths.ply)  # (N, 3) each, in COLMAP's frame

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import sys
@@ -27,7 +28,7 @@ class ExampleConfig:
     """What the example does."""
 
     failure: str = knob(
-        "none", "how to fail", choices=("none", "interrupt", "terminate", "environment", *"abcdefg")
+        "none", "how to fail", choices=("none", "interrupt", "terminate", "environment", *"abcdefgh")
     )
     mask_path: Path | None = knob(None, "folder of masks")
     overwrite: bool = knob(False, "replace earlier results")
@@ -67,6 +68,7 @@ ERRORS: dict[str, Exception] = {
     "e": ZeroDivisionError("division by zero"),
     "f": MemoryError(),
     "g": RuntimeError("DefaultCPUAllocator: can't allocate memory"),
+    "h": OSError(errno.EROFS, "Read-only file system", "scene/mesh.ply"),
 }
 
 

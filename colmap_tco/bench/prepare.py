@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from colmap_tco.datasets.base import Floats, Frame, Scene, inverse, pixel_centres, rays
 from colmap_tco.errors import InputError
+from colmap_tco.image_files import read_image
 from colmap_tco.pinhole import Pinhole
-from colmap_tco.workspace import read_image
 
 if TYPE_CHECKING:
     from tco.types import Cameras, Priors, Views

@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from colmap_tco import _pycolmap
 from colmap_tco._pycolmap import Model
 from colmap_tco.dense import by_position, dense_views, point_confidence, thinned
+from colmap_tco.image_files import read_image
 from colmap_tco.maps import read_map
 from colmap_tco.page.quantise import grid, levels, lossless, normal_codes, packed, photograph
 from colmap_tco.ply import read_ply, read_vis
 from colmap_tco.priors import held_out, usable_points
 from colmap_tco.tracks import Tracks, read_tracks
 from colmap_tco.views import View
-from colmap_tco.workspace import DensePaths, read_image
+from colmap_tco.workspace import DensePaths
 
 log = logging.getLogger(__name__)
 

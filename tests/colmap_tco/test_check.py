@@ -86,6 +86,11 @@ def test_bare_images_are_enough(room: Room, tmp_path: Path) -> None:
     found = check(tmp_path, PLAIN, Progress())
     assert f"7 images in {tmp_path / 'images'}, which densify would map first" in found.images
     assert found.needs[0].size == (256, 192)
+    alone = tmp_path / "alone" / "images"
+    alone.mkdir(parents=True)
+    shutil.copy(next((room.root / "images").iterdir()), alone)
+    with pytest.raises(InputError, match="one picture; densify needs at least two"):
+        check(alone.parent, PLAIN, Progress())
     elsewhere = replace(PLAIN, workspace=replace(PLAIN.workspace, image_path=str(room.root / "sparse")))
     with pytest.raises(InputError, match="no pictures"):
         check(tmp_path, elsewhere, Progress())

@@ -15,17 +15,16 @@ from PIL import Image
 
 from colmap_tco import _pycolmap
 from colmap_tco.errors import InputError
+from colmap_tco.image_files import decoded_size, list_images, read_image
 from colmap_tco.workspace import (
     DensePaths,
     WorkspaceConfig,
-    decoded_size,
     dense_paths,
     find_images,
     find_models,
-    list_images,
     open_workspace,
     partial_paths,
-    read_image,
+    unregistered_images,
 )
 
 
@@ -285,3 +284,30 @@ def test_pinhole_models_keep_ids_names_poses_and_points(name: str, shared: Path)
     assert new.compute_num_observations() == model.compute_num_observations()
     old = np.mean([point.error for point in model.points3D.values()])
     assert new.compute_mean_reprojection_error() == pytest.approx(old, rel=0.05)
+
+
+def test_pictures_that_are_not_in_the_model_say_what_is_wrong_with_them(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Not registered for want of matches, not whole, or of a kind that COLMAP does not read."""
+    folder = tmp_path / "images"
+    (folder / "phone").mkdir(parents=True)
+    cv2.imwrite(str(folder / "fine.png"), np.zeros((8, 8, 3), np.uint8))
+    (folder / "notes.jpg").write_text("not a picture")
+    (folder / "empty.png").touch()
+    (folder / "phone" / "IMG_1.HEIC").touch()
+    (folder / "other.png").touch()
+    why = unregistered_images(tmp_path, folder, [], {"other.png": Path("sparse/1")})
+    assert list(why) == ["phone/IMG_1.HEIC", "empty.png", "fine.png", "notes.jpg", "other.png"]
+    assert why["fine.png"].startswith("COLMAP did not register it: too few matches")
+    assert "cannot be decoded" in why["notes.jpg"] and "cannot be decoded" in why["empty.png"]
+    assert why["phone/IMG_1.HEIC"] == "COLMAP reads no HEIC; convert it to JPEG"
+    assert "registered it in sparse/1" in why["other.png"]
+
+
+def test_a_folder_of_pictures_that_colmap_does_not_read_says_so(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a.dng").touch()
+    told = r"convert those that are there to JPEG:\n  images/a\.dng: COLMAP reads no DNG"
+    with pytest.raises(InputError, match=told):
+        find_images(tmp_path)
