@@ -108,10 +108,15 @@ def predict_chunks(
 
 
 def _loaded(chosen: Selected, config: TCOConfig) -> Backbone:
-    """The network, if it has the layers that are to be adapted; the optimisation would find out later."""
+    """The network, if it has what the settings are about; the optimisation would find out later, or never."""
     from tco.lora import LoRAConfig, adapted
 
     backbone = load(chosen)
+    if backbone.uses_cameras and config.own_cameras != "published":
+        raise UsageError(
+            f"--own_cameras {config.own_cameras}: {backbone.name} is given the cameras and finds none of its "
+            "own; what holds their corrections are camera_weight and camera_kernel"
+        )
     if not config.steps:
         return backbone
     names = LoRAConfig(targets=config.lora_targets, unfrozen=config.ablation.unfrozen)

@@ -81,7 +81,7 @@ waits for threads to wake; with many, a busy one waits for threads that only wai
 environment takes others, to compare."""
 
 
-UNWRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT)
+REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC)
 """Errors of the system that the user can do something about."""
 
 
@@ -89,7 +89,7 @@ def exit_code(error: BaseException) -> int:
     """The exit code that tells a script what kind of failure ``error`` is."""
     if isinstance(error, DensifyError):
         return error.exit_code
-    if isinstance(error, OSError) and error.errno in UNWRITABLE and error.filename:
+    if isinstance(error, OSError) and error.errno in REFUSED and error.filename:
         return InputError.exit_code
     if isinstance(error, KeyboardInterrupt):
         return INTERRUPTED
@@ -171,10 +171,10 @@ class _Outcome:
 def _sentence(error: BaseException, code: int) -> str:
     if isinstance(error, DensifyError):
         return str(error)
-    if isinstance(error, OSError) and error.errno in UNWRITABLE and error.filename:
+    if isinstance(error, OSError) and error.errno in REFUSED and error.filename:
         return (
-            f"{error.filename}: it cannot be written ({error.strerror}); change that, or name another place "
-            "with --output_path where the command has it"
+            f"{error.filename}: the system refuses it ({error.strerror}); give the right to it or make room, "
+            "or name another place for results (--output_path)"
         )
     if isinstance(error, _Terminated):
         return "stopped by SIGTERM"

@@ -24,10 +24,15 @@ def list_images(folder: Path, recursive: bool = True) -> list[str]:
 
 
 def other_formats(folder: Path, recursive: bool = True) -> dict[str, str]:
-    """Name → why it is not used, of the pictures below a folder that are of :data:`OTHERS`."""
+    """Name → why it is not used, of the pictures below a folder that are of :data:`OTHERS`.
+
+    Those beside a picture of the same name are left out: cameras write both, and who converts keeps both.
+    """
+    usable = {name.rpartition(".")[0].lower() for name in list_images(folder, recursive)}
     return {
         name: f"COLMAP reads no {name.rpartition('.')[2].upper()}; convert it to JPEG"
         for name in _names(folder, recursive, OTHERS)
+        if name.rpartition(".")[0].lower() not in usable
     }
 
 

@@ -185,14 +185,14 @@ def open_workspace(
         log.info("%s", reason)
     if skipped:
         log.warning("%d of %d images are skipped:\n%s", len(skipped), len(entries), listing(skipped))
-    others = unregistered_images(root, folder, [entry.name for entry in entries], elsewhere)
+    others = unregistered_images(root, folder, [entry.name for entry in entries], elsewhere, num_threads)
     if others:
         log.warning("%d pictures are not in the model:\n%s", len(others), listing(others))
     return Workspace(root, folder, model_path, model, images, tuple(reasons), skipped, others)
 
 
 def unregistered_images(
-    root: Path, folder: Path, names: Sequence[str], elsewhere: Mapping[str, Path]
+    root: Path, folder: Path, names: Sequence[str], elsewhere: Mapping[str, Path], num_threads: int = -1
 ) -> dict[str, str]:
     """Name → reason for the pictures in the image folder that the model has no camera of.
 
@@ -201,10 +201,13 @@ def unregistered_images(
         folder: of the images.
         names: of the registered images.
         elsewhere: name → another model of the workspace that has it.
+        num_threads: that decode the pictures, one a core if not positive.
     """
     recursive = folder != root
     left = sorted(set(list_images(folder, recursive)) - set(names))
-    return other_formats(folder, recursive) | {name: _why_not(folder, name, elsewhere) for name in left}
+    with ThreadPoolExecutor(num_threads if num_threads > 0 else os.cpu_count() or 1) as pool:
+        reasons = pool.map(lambda name: _why_not(folder, name, elsewhere), left)
+        return other_formats(folder, recursive) | dict(zip(left, reasons, strict=True))
 
 
 def _why_not(folder: Path, name: str, elsewhere: Mapping[str, Path]) -> str:

@@ -61,7 +61,7 @@ def test_success_prints_the_summary_on_stdout_alone() -> None:
         ("e", 1, "ZeroDivisionError: division by zero; the option -v"),
         ("f", 4, "--max_image_size"),
         ("g", 4, "--max_image_size"),
-        ("h", 3, "scene/mesh.ply: it cannot be written (Read-only file system)"),
+        ("h", 3, "scene/mesh.ply: the system refuses it (Read-only file system)"),
         ("interrupt", 130, "interrupted"),
         ("terminate", 130, "stopped by SIGTERM"),
     ],

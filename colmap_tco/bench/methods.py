@@ -68,12 +68,16 @@ def check_row(network: Backbone, row: Row) -> None:
 
 
 def check_settings(row: Row, config: TCOConfig) -> None:
-    """Whether the settings of a run, as the row changes them, make use of its priors.
+    """Whether the settings of a run, as the row changes them, make use of its priors, and are all of use.
 
     Raises:
-        InputError: they do not.
+        InputError: they do not, or are not.
     """
     config = row.config(config)
+    if config.own_cameras != "published":
+        raise InputError(
+            f"--own_cameras {config.own_cameras}: the cameras of a dataset have no standard deviations"
+        )
     if "depth" in row.priors and config.steps and not config.depth_weight:
         raise InputError(
             f"--rows {row.name} has depths as priors, which count for nothing: give --depth_weight"

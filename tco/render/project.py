@@ -64,12 +64,13 @@ def project(
     origin = frame.new_tensor([0.0, 0.0, 1.0]).expand(len(surfels), 3).unsqueeze(-1)
     local = torch.cat([frame, origin], -1).reshape(-1, 4)
     transforms = (local @ pixels_from_world.transpose(-1, -2)).reshape(len(cameras), len(surfels), 3, 3)
-    columns = transforms.to(surfels.means.dtype).unbind(-1)
+    rounded = transforms.to(surfels.means.dtype)
+    columns = rounded.unbind(-1)
     depths = columns[2][..., 2]
     centres, ellipse = _centres(*columns)
     seen = ellipse & (depths > near) & (surfels.opacities > MIN_ALPHA)
     with torch.no_grad():
-        boxes = _boxes(torch.stack(columns, -1), centres, surfels.opacities, seen, size)
+        boxes = _boxes(rounded, centres, surfels.opacities, seen, size)
     return Splats(transforms, centres, depths, surfels.opacities, surfels.colors, boxes)
 
 

@@ -757,6 +757,9 @@ def test_exit_code_2_for_layers_that_the_network_does_not_have(
     words = ("densify", str(fresh_room.root), *FLAGS, "--lora_targets", "conv,nonsense")
     assert command(*words, "--steps", "1") == 2
     assert "--lora_targets, --unfrozen: the target 'nonsense' fits no" in capsys.readouterr().err
+    words = ("densify", str(fresh_room.root), *FLAGS, "--own_cameras", "uncertainty")
+    assert command(*words) == 2
+    assert "--own_cameras uncertainty: sweep is given the cameras" in capsys.readouterr().err
     assert not finished(fresh_room.root)
 
 

@@ -296,6 +296,7 @@ def test_pictures_that_are_not_in_the_model_say_what_is_wrong_with_them(
     (folder / "notes.jpg").write_text("not a picture")
     (folder / "empty.png").touch()
     (folder / "phone" / "IMG_1.HEIC").touch()
+    (folder / "FINE.CR2").touch()  # beside fine.png, as cameras write both
     (folder / "other.png").touch()
     why = unregistered_images(tmp_path, folder, [], {"other.png": Path("sparse/1")})
     assert list(why) == ["phone/IMG_1.HEIC", "empty.png", "fine.png", "notes.jpg", "other.png"]

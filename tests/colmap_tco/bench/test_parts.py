@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from colmap_tco.bench.figures import point_figures, pose_figures
-from colmap_tco.bench.methods import check_row, held_priors, reconstruct, rescaled
+from colmap_tco.bench.methods import check_row, check_settings, held_priors, reconstruct, rescaled
 from colmap_tco.bench.noise import Noise
 from colmap_tco.bench.numbers import published as numbers
 from colmap_tco.bench.prepare import resized, unproject
@@ -347,3 +347,10 @@ def test_networks_that_predict_cameras_can_run_every_row() -> None:
         ["base", "raw-depth", "tco", "pose", "intrinsics", "heads"], ["pose", "intrinsics"]
     ):
         check_row(tiny_vggt(), row)
+
+
+def test_settings_that_count_for_nothing_are_refused() -> None:
+    (row,) = parse_rows(["tco"], ("pose", "intrinsics"))
+    check_settings(row, TCOConfig())
+    with pytest.raises(InputError, match="--own_cameras uncertainty: the cameras of a dataset have no"):
+        check_settings(row, TCOConfig(own_cameras="uncertainty"))
