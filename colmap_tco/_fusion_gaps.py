@@ -15,7 +15,7 @@ from colmap_tco.workers import Workers
 
 @dataclass(frozen=True)
 class _Part:
-    """The points of one reference view: (M, 3) in its frame, and the camera (6,) of its maps."""
+    """The points of one reference view: (3, M) in its frame, and the camera (6,) of its maps."""
 
     points: NDArray[np.float32]
     camera: NDArray[np.float64]
@@ -36,12 +36,12 @@ class Covered:
 
     def __bool__(self) -> bool:
         """Whether there are points."""
-        return any(len(part.points) for part in self._parts.values())
+        return any(part.points.size for part in self._parts.values())
 
     def add(self, position: int, points: NDArray[np.float64], camera: NDArray[np.float64]) -> None:
         """The points (M, 3) of a view in the frame of the model, and the camera (6,) of its maps."""
         view = self._views[position]
-        local = (points - centre(view)) @ view.cam_from_world[:3, :3].T
+        local = view.cam_from_world[:3, :3] @ (points - centre(view)).T
         self._parts[position] = _Part(local.astype(np.float32), camera)
 
     def mark(
@@ -67,8 +67,8 @@ class Covered:
         def mark(other: int) -> None:
             part = self._parts[other]
             move = other_from_reference(self._views[position], self._views[other])
-            pair = _fusion_kernels.pair(part.camera, camera, move)
-            every = np.arange(len(part.points))
-            _merge_kernels.mark_taken(part.points, every, packed, pair, (depth_error, 0.5), taken)
+            pair = _fusion_kernels.pair(part.camera, camera, move).astype(np.float32)
+            every, limits = np.ones(part.points.shape[1], np.uint64), (depth_error, 0.5)
+            _merge_kernels.mark_taken(part.points, every, np.uint64(1), packed, pair, limits, taken)
 
         workers.map(mark, sorted(self._near[position] & self._parts.keys()))

@@ -7,7 +7,7 @@ in memory together, so that what is noted of its pixels stays in the thread's ow
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,9 +31,6 @@ _COLOR_SAMPLES = 15
 _FEWEST_VIEWS = 3
 """Where fewer views than ``min_num_pixels`` can see a point, all of them but at least these must agree."""
 
-Group = list[tuple[int, ShelfView]]
-"""Neighbours that are in memory together, with their slots."""
-
 
 @dataclass(frozen=True)
 class Bounds:
@@ -46,6 +43,32 @@ class Bounds:
 
     tolerance: Tolerance
     widths: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class _Neighbour:
+    """A neighbour of the reference that is in memory.
+
+    Attributes:
+        slot: its number among the neighbours.
+        view: it.
+        maps: the reference and its maps, see :func:`colmap_tco._fusion_kernels.pair`.
+        image: the reference and its image.
+    """
+
+    slot: int
+    view: ShelfView
+    maps: _vote_kernels.Pair
+    image: _vote_kernels.Pair
+
+    @property
+    def bit(self) -> np.uint64:
+        """Its bit in its word."""
+        return np.uint64(1) << np.uint64(self.slot & 63)
+
+
+Group = list[_Neighbour]
+"""Neighbours that are in memory together."""
 
 
 @dataclass(frozen=True)
@@ -72,21 +95,19 @@ class _Points:
     """The K pixels of a part that became points.
 
     Attributes:
-        who: of the part.
+        who: (words, K) one bit for each neighbour that agrees.
         failed: of the part.
-        kept: (K,) pixels of the part.
         supports: (K,) views that agree on each, the reference included.
-        local: (K, 3) in the frame of the reference.
+        local: (3, K) in the frame of the reference.
         points: (K, 3) in the frame of the model.
         normals: (K, 3) there.
-        samples: (K, S, 3) colours.
+        samples: (tiles, S, 3, TILE) colours, see :mod:`colmap_tco._merge_kernels`.
         sampled: (K,) how many of the S are filled.
         removed: (4,) see :func:`colmap_tco._vote_kernels.accept`.
     """
 
     who: NDArray[np.uint64]
     failed: NDArray[np.int64]
-    kept: NDArray[np.int64]
     supports: NDArray[np.int64]
     local: NDArray[np.float32]
     points: NDArray[np.float64]
@@ -149,7 +170,7 @@ class Reference:
         """The points of these pixels (M,), flat indices into the reference, range by range."""
         run = self._shelf.workers
         merged = self._points([pixels[first : first + _RANGE] for first in range(0, len(pixels), _RANGE)])
-        for group in self._shelf.together(self._position, self._neighbours):
+        for group in self._groups():
             run.map(lambda points, group=group: self._color(points, group), merged)  # type: ignore[misc]
         _count(report, merged)
         return run.map(self._finish, merged)
@@ -165,10 +186,18 @@ class Reference:
             parts[i] = part if voted < len(self._neighbours) else None
             return None if parts[i] else self._merge(part)
 
-        for group in self._shelf.together(self._position, self._neighbours):
+        for group in self._groups():
             voted += len(group)
             merged = self._shelf.workers.map(vote, range(len(ranges)))
         return [points for points in merged if points is not None]
+
+    def _groups(self) -> Iterator[Group]:
+        """The neighbours, as many at a time as fit into memory."""
+        for group in self._shelf.together(self._position, self._neighbours):
+            yield [
+                _Neighbour(slot, view, self._pair(slot, view.camera), self._pair(slot, view.image_camera))
+                for slot, view in group
+            ]
 
     def _block(self) -> int:
         """Pixels that are voted on together."""
@@ -187,10 +216,9 @@ class Reference:
         tolerance, config = self._tolerance, self._config
         cosine = math.cos(math.radians(tolerance.normal))
         limits = (tolerance.depth, tolerance.reproj, cosine, config.sigma_at_one, config.most_depth_error)
-        for slot, other in group:
-            pair = self._pair(slot, other.camera).astype(np.float32)
+        for n in group:
             _vote_kernels.vote(
-                part.tiles, part.votes, other.packed, pair, limits, slot, part.who, part.failed
+                part.tiles, part.votes, n.view.packed, n.maps, limits, n.slot, part.who, part.failed
             )
 
     def _merge(self, part: _Part) -> _Points:
@@ -207,52 +235,46 @@ class Reference:
         removed = np.zeros(4, np.int64)
         count = _vote_kernels.accept(part.tiles, part.count, rules, kept, supports, removed)
         kept, supports = kept[:count].copy(), supports[:count].copy()
-        means = np.empty((count, 3), np.float32), np.empty((count, 3)), np.empty((count, 3), np.float32)
+        means = np.empty((3, count), np.float32), np.empty((count, 3)), np.empty((count, 3), np.float32)
         pose = np.concatenate([view.cam_from_world[:3, :3], centre(view)[None]])
         _mean_kernels.average(
             part.tiles, part.votes, kept, own.camera, pose, self._centres, self._widths, means
         )
-        samples = np.empty((count, min(_COLOR_SAMPLES, 1 + len(self._neighbours)), 3), np.uint8)
-        sampled = np.zeros(count, np.uint8)
-        pair = _fusion_kernels.pair(own.camera, own.image_camera, np.eye(3, 4))
-        _merge_kernels.sample_colors(means[0], np.arange(count), pair, own.image, samples, sampled)
-        return _Points(part.who, part.failed, kept, supports, *means, samples, sampled, removed)
+        tile = _vote_kernels.TILE
+        slots = min(_COLOR_SAMPLES, 1 + len(self._neighbours))
+        samples, sampled = np.empty((-(-count // tile), slots, 3, tile), np.uint8), np.zeros(count, np.uint8)
+        pair = _fusion_kernels.pair(own.camera, own.image_camera, np.eye(3, 4)).astype(np.float32)
+        every, bit = np.ones(count, np.uint64), np.uint64(1)
+        _merge_kernels.sample_colors(means[0], every, bit, pair, own.image, samples, sampled)
+        return _Points(part.who[:, kept], part.failed, supports, *means, samples, sampled, removed)
 
     def _color(self, points: _Points, group: Group) -> None:
         """Sample the colours of a group's images, and mark as taken the pixels that a point is made of."""
-        chosen = np.empty(len(points.kept) + 1, np.int64)
-        for slot, other in group:
-            who = points.who[slot >> 6]
-            found = chosen[: _merge_kernels.agreeing(who, points.kept, _bit(slot), chosen)]
-            pair = self._pair(slot, other.image_camera)
+        for n in group:
+            local, who = points.local, points.who[n.slot >> 6]
             _merge_kernels.sample_colors(
-                points.local, found, pair, other.image, points.samples, points.sampled
+                local, who, n.bit, n.image, n.view.image, points.samples, points.sampled
             )
-            if self._neighbours[slot] < self._position:
+            if self._neighbours[n.slot] < self._position:
                 continue  # it has been the reference, and will not be again
-            pair, limits = self._pair(slot, other.camera), (self._tolerance.depth, 0.0)
-            _merge_kernels.mark_taken(points.local, found, other.packed, pair, limits, other.taken)
+            limits = self._tolerance.depth, 0.0
+            _merge_kernels.mark_taken(local, who, n.bit, n.view.packed, n.maps, limits, n.view.taken)
 
     def _finish(self, points: _Points) -> Cloud:
         """The points with their colours and visibility."""
-        colors = np.empty((len(points.kept), 3), np.uint8)
+        colors = np.empty((len(points.supports), 3), np.uint8)
         _merge_kernels.median_colors(points.samples, points.sampled, colors)
         own = self._views[self._position].index
         theirs = np.array([self._views[p].index for p in self._neighbours], np.uint32)
         start = np.concatenate([[0], points.supports]).cumsum()
         images = np.empty(start[-1], np.uint32)
         order, before = np.argsort(theirs, kind="stable"), int((theirs < own).sum())
-        _merge_kernels.list_views(points.who, points.kept, order, theirs, (before, own), images)
+        _merge_kernels.list_views(points.who, order, theirs, (before, own), images)
         return Cloud(points.points, points.normals, colors, Visibility(start, images))
 
-    def _pair(self, slot: int, camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _pair(self, slot: int, camera: NDArray[np.float64]) -> NDArray[np.float32]:
         """The reference and the neighbour in this slot, of which ``camera`` is the map's or the image's."""
-        return _fusion_kernels.pair(self._own.camera, camera, self._transforms[slot])
-
-
-def _bit(slot: int) -> np.uint64:
-    """The bit of a neighbour in its word."""
-    return np.uint64(1) << np.uint64(slot & 63)
+        return _fusion_kernels.pair(self._own.camera, camera, self._transforms[slot]).astype(np.float32)
 
 
 def _count(report: FusionReport, merged: Sequence[_Points]) -> None:

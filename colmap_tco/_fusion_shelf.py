@@ -88,6 +88,11 @@ class Shelf:
         self._in_use: set[int] = set()
         self._taken: dict[int, NDArray[np.uint8]] = {}
         """One bit a pixel of the views that are not held."""
+        self._last = list(range(len(views)))
+        """The last reference that needs each view."""
+        for reference, view in enumerate(views):
+            for other in view.neighbours[: config.check_num_images]:
+                self._last[other] = max(self._last[other], reference)
 
     def get(self, position: int) -> ShelfView:
         """The view at this position of the list, read if it is not held."""
@@ -104,7 +109,9 @@ class Shelf:
         return self._held[position]
 
     def finish(self, position: int) -> None:
-        """Forget which pixels of a view are taken: it has been the reference, and those before it."""
+        """Drop the views that no reference after this one needs, and forget which of its pixels are taken."""
+        for done in [p for p in self._held if self._last[p] <= position]:
+            self._bytes -= self._held.pop(done).nbytes
         self._taken.pop(position, None)
         self._finished = position + 1
 

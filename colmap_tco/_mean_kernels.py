@@ -33,7 +33,7 @@ from colmap_tco._vote_kernels import (
 )  # fmt: skip
 
 Points = tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float32]]
-"""M points: (M, 3) in the frame of the reference, (M, 3) in that of the model, normals (M, 3) there."""
+"""M points: (3, M) in the frame of the reference, (M, 3) in that of the model, normals (M, 3) there."""
 
 # The rows of the scratch of one tile, as where they begin.
 _H, _MEAN, _TOTAL, _MOVED, _TURN, _NORMAL, _BY, _FROM = (k * TILE for k in (0, 1, 2, 3, 4, 7, 10, 11))
@@ -186,7 +186,7 @@ def _place(
     x += (x * by - w[_FROM + m]) * scale
     y += (y * by - w[_FROM + TILE + m]) * scale
     z += (z * by - w[_FROM + 2 * TILE + m]) * scale
-    local[k, 0], local[k, 1], local[k, 2] = x, y, z
+    local[0, k], local[1, k], local[2, k] = x, y, z
     a, b, c = float(w[_TURN + m]), float(w[_TURN + TILE + m]), float(w[_TURN + 2 * TILE + m])
     for axis in range(3):
         points[k, axis] = x * pose[0, axis] + y * pose[1, axis] + z * pose[2, axis] + pose[3, axis]

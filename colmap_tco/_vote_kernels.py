@@ -213,8 +213,8 @@ def _judge(w: Scratch, limits: Limits) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _add(tile: NDArray[np.float32], w: Scratch, votes: NDArray[np.float32], at: int) -> None:
-    """Count the votes of the other view on a tile, and note them in ``votes`` from ``at`` on."""
+def _add(tile: NDArray[np.float32], w: Scratch, votes: NDArray[np.float32]) -> None:
+    """Count the votes of the other view on a tile, and note them in its ``votes`` (VOTE_SIZE,)."""
     unseen, through, agree = np.float32(UNSEEN), np.float32(THROUGH), np.float32(AGREES)
     for m in range(TILE):
         outcome = w[_OUTCOME + m]
@@ -223,11 +223,11 @@ def _add(tile: NDArray[np.float32], w: Scratch, votes: NDArray[np.float32], at: 
         tile[CONFLICTS + m] += _1 if outcome == through else _0
     for m in range(TILE):
         agrees = w[_OUTCOME + m] == agree
-        votes[at + WEIGHT + m] = w[_C + m] if agrees else _0
-        votes[at + OFF + m] = w[_ERROR + m] if agrees else _0
-        votes[at + TURNED + m] = w[_TURNED + m] if agrees else _0
-        votes[at + TURNED + TILE + m] = w[_TURNED + TILE + m] if agrees else _0
-        votes[at + TURNED + 2 * TILE + m] = w[_TURNED + 2 * TILE + m] if agrees else _0
+        votes[WEIGHT + m] = w[_C + m] if agrees else _0
+        votes[OFF + m] = w[_ERROR + m] if agrees else _0
+        votes[TURNED + m] = w[_TURNED + m] if agrees else _0
+        votes[TURNED + TILE + m] = w[_TURNED + TILE + m] if agrees else _0
+        votes[TURNED + 2 * TILE + m] = w[_TURNED + 2 * TILE + m] if agrees else _0
 
 
 @njit(cache=True, error_model="numpy")
@@ -283,7 +283,7 @@ def vote(
         _compare(tile, w, pair)
         _allow(tile, w, limits)
         _judge(w, limits)
-        _add(tile, w, votes[t], at)
+        _add(tile, w, votes[t, at : at + VOTE_SIZE])
         _widen(tile, w, pair)
         by_depth, by_reprojection, by_normal = np.int32(0), np.int32(0), np.int32(0)
         for m in range(TILE):

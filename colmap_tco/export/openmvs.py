@@ -66,7 +66,10 @@ def write_openmvs(dense: Dense, folder: Path) -> str:
     write_ply(target.ply, cloud.points - offset, cloud.normals, cloud.colors)
     write_vis(target.vis, Visibility(cloud.visibility.start, place[cloud.visibility.images]))
     tell_offset(folder, offset)
-    return f"{len(views)} images with depth maps, {len(cloud)} points; read it with InterfaceCOLMAP -i"
+    return (
+        f"{len(views)} images with depth maps, {len(cloud)} points; "
+        "to read it: InterfaceCOLMAP -w (this folder) -i . -o scene.mvs"
+    )
 
 
 def _sparse(dense: Dense, views: list[DenseView], names: dict[str, str]) -> SparseModel:

@@ -8,13 +8,15 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
+import plyfile
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from colmap_tco import _pycolmap
 from colmap_tco.export.command import ExportConfig, export
-from colmap_tco.ply import read_ply, write_ply
+from colmap_tco.maps import read_map
+from colmap_tco.ply import read_ply, read_vis, write_ply
 from colmap_tco.progress import Progress
 from colmap_tco.workspace import DensePaths
 from tests.colmap_tco.test_outputs import NORMAL, PIXEL, densify, make_workspace
@@ -161,15 +163,59 @@ def test_a_trainer_of_splats_reads_the_splatting_export(paths: DensePaths, tmp_p
             np.testing.assert_allclose([fx * x / z + cx, fy * y / z + cy], image.xys[index], atol=1e-6)
 
 
-def test_the_openmvs_importer_takes_the_export(paths: DensePaths, tmp_path: Path) -> None:
-    program = shutil.which("InterfaceCOLMAP")
-    if program is None:
-        pytest.skip("OpenMVS' InterfaceCOLMAP is not installed, and Debian has no package of it")
-    out = tmp_path / "openmvs"
-    export("openmvs", paths.root, ExportConfig(output_path=out), Progress())
-    words = [program, "-i", str(out), "-o", str(tmp_path / "scene.mvs"), "-w", str(tmp_path)]
+def openmvs(program: str, folder: Path, *words: str) -> str:
+    """Run a program of OpenMVS in the folder of the export; what it says. Skips where it is not installed."""
+    found = shutil.which(program)
+    if found is None:
+        pytest.skip(f"OpenMVS' {program} is not installed, and Debian has no package of it")
+    words = (found, "-w", str(folder), *words)
     done = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert done.returncode == 0 and (tmp_path / "scene.mvs").stat().st_size > 0, done.stdout + done.stderr
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def imported(paths: DensePaths, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The export for OpenMVS with ``scene.mvs``, as its importer wrote it; and what it said."""
+    out = tmp_path_factory.mktemp("openmvs") / "export"
+    export("openmvs", paths.root, ExportConfig(output_path=out), Progress())
+    return out, openmvs("InterfaceCOLMAP", out, "-i", ".", "-o", "scene.mvs")
+
+
+def test_the_openmvs_importer_takes_model_cloud_and_maps(
+    paths: DensePaths, imported: tuple[Path, str]
+) -> None:
+    out, said = imported
+    model, points = _pycolmap.read_model(paths.sparse), read_ply(paths.ply)[0]
+    images, sparse = len(model.images), len(model.points3D)
+    assert f"Exported data: {images} images, {sparse} points, {len(points)} dense points" in said
+    assert len(list(out.glob("depth*.dmap"))) == images
+    cloud = plyfile.PlyData.read(str(out / "scene.ply"))["vertex"]
+    np.testing.assert_array_equal(np.stack([cloud[axis] for axis in "xyz"], 1), points)
+    ours = read_vis(paths.vis)
+    names = [model.images[i].name for i in sorted(model.images)]
+    order = [sorted(names).index(name) for name in names]
+    theirs = [sorted(views.tolist()) for views in cloud["view_indices"]]
+    assert theirs == [sorted(order[i] for i in views) for views in np.split(ours.images, ours.start[1:-1])]
+
+
+def test_openmvs_fuses_our_maps_to_our_surface(paths: DensePaths, imported: tuple[Path, str]) -> None:
+    """With the cameras, neighbours, depths and normals of the export, no pixel matched again."""
+    out, _ = imported
+    shape = read_map(next(paths.stereo.glob("depth_maps/*.bin"))).shape
+    openmvs("DensifyPointCloud", out, "scene.mvs", "-o", "dense.mvs", "--resolution-level", "0",
+            "--max-resolution", str(max(shape)), "--min-resolution", "1", "--geometric-iters", "0",
+            "--postprocess-dmaps", "0", "--max-threads", "1")  # fmt: skip
+    cloud = plyfile.PlyData.read(str(out / "dense.ply"))["vertex"]
+    theirs = np.stack([cloud[axis] for axis in "xyz"], 1)
+    assert len(theirs) > 0.5 * len(read_ply(paths.ply)[0])
+    assert np.median(np.abs(theirs @ NORMAL)) < 0.5 * PIXEL
+
+
+def test_openmvs_meshes_our_cloud(paths: DensePaths, imported: tuple[Path, str]) -> None:
+    out, _ = imported
+    openmvs("ReconstructMesh", out, "scene.mvs", "-p", "scene.ply", "-o", "mesh.ply", "--max-threads", "1")
+    assert_plane(mesh_vertices(out / "mesh.ply"), read_ply(paths.ply)[0])
 
 
 def test_the_colmap_command_reads_the_text_export(paths: DensePaths, tmp_path: Path) -> None:
@@ -199,7 +245,6 @@ def test_trimesh_reads_points_and_colours(paths: DensePaths) -> None:
 
 
 def test_plyfile_reads_points_normals_and_colours(paths: DensePaths) -> None:
-    plyfile = pytest.importorskip("plyfile", reason="plyfile is not installed")
     vertices = plyfile.PlyData.read(str(paths.ply))["vertex"]
     for columns, expected in zip(
         ("xyz", ("nx", "ny", "nz"), ("red", "green", "blue")), read_ply(paths.ply), strict=True
