@@ -20,7 +20,7 @@ def _of(file: str, tests: str, *changes: tuple[str, str]) -> list[Mutation]:
     return [Mutation(file, old, new, names) for old, new in changes]
 
 
-FUSION = ("tests/colmap_tco/test_fusion_gaps.py", "tests/colmap_tco/test_fusion.py")
+FUSION = tuple(f"tests/colmap_tco/test_{name}.py" for name in ("merge_kernels", "fusion_gaps", "fusion"))
 
 MUTATIONS = [
     *_of(
@@ -179,8 +179,14 @@ MUTATIONS = [
             ("colmap_tco/_vote_kernels.py", "dx - here_x * dz", "dx + here_x * dz"),
             ("colmap_tco/_vote_kernels.py", "through if off > _0", "through if off < _0"),
             ("colmap_tco/_fusion_gaps.py", "(depth_error, 0.5)", "(depth_error, 0.0)"),
-            ("colmap_tco/_fusion_gaps.py", "(points - centre(view)) @", "(points + centre(view)) @"),
+            ("colmap_tco/_fusion_gaps.py", "(points - centre(view)).T", "(points + centre(view)).T"),
             ("colmap_tco/_fusion_gaps.py", "self._near[j].add(i)", "self._near[j].add(j)"),
+            ("colmap_tco/_merge_kernels.py", "p += a *", "p += b *"),
+            ("colmap_tco/_merge_kernels.py", "+ cy - _HALF, _0), bottom)", "+ cy, _0), bottom)"),
+            ("colmap_tco/_merge_kernels.py", "channel[have >> 1, m]", "channel[(have - np.uint32(1)) >> 1, m]"),
+            ("colmap_tco/_merge_kernels.py", "_REACH * min(w[_SIZE + m], _2)", "_REACH * w[_SIZE + m]"),
+            ("colmap_tco/_merge_kernels.py", "abs(other[j, i, 0] - z) <= off", "abs(other[j, i, 0] - z) >= _0"),
+            ("colmap_tco/_fusion_shelf.py", "self._last[p] <= position", "self._last[p] < position"),
             ("colmap_tco/_fusion_shelf.py", "taken[unsure] = 1", "packed[unsure, 0] = 0"),
             ("colmap_tco/_fusion_shelf.py", "taken[unsure] = 1", "taken[unsure] = 0"),
             ("colmap_tco/_fusion_shelf.py", "((maps.error > 0) &", "((maps.error >= 0) &"),
