@@ -121,12 +121,14 @@ class Progress:
         if not self._done or self._done - counted <= _TOO_LITTLE * self._total:
             start = self._run_start if self._shares else self._stage_start
             return remaining(now - start, self.fraction) if self.fraction >= _TOO_EARLY else None
-        left = (now - since) / (self._done - counted) * max(0, self._total - self._done)
+        pace = (now - since) / (self._done - counted)
+        left = pace * max(0, self._total - self._done)
         if not self._shares:
             return left
         own = self._shares[self._names[-1]]
         later = max(0.0, 1 - self._finished - own)
-        return left + (now - self._stage_start + left) * later / own if own > 0 else left
+        # What was compiled and loaded in this stage is not in the share of the later ones.
+        return left + pace * self._total * later / own if own > 0 else left
 
     def close(self) -> None:
         """Take the bar off the screen, so that messages start on a clean line."""

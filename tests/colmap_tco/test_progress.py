@@ -53,7 +53,7 @@ def test_a_slow_start_does_not_frighten(monkeypatch: pytest.MonkeyPatch) -> None
     assert progress.seconds_left is None
     now = 53.0
     progress.advance(3)
-    assert progress.seconds_left == pytest.approx(46 + (33 + 46) * 18 / 80)
+    assert progress.seconds_left == pytest.approx(46 + 50 * 18 / 80)
     now = 99.0
     progress.advance(46)
     progress.stage("fuse", 1)
