@@ -246,10 +246,13 @@ def _parse(words: list[str], commands: Mapping[str, Command]) -> tuple[str, list
     # No global option takes a value, so the first bare word is the command.
     chosen = next((word for word in words if not word.startswith("-")), None)
     config_type: type | None = None
-    known = ["--verbose", "--quiet", "--log_json", "--version", "--help"]
+    known = ["--verbose", "--quiet", "--log_json", "--version", "--help", HELP_ALL]
     if chosen is not None and chosen in commands:
         config_type = _load(commands[chosen].config)
-        flags.add_flags(subs[chosen], config_type)
+        told = () if HELP_ALL in words else commands[chosen].common.split()
+        more = flags.add_flags(subs[chosen], config_type, told)
+        if more:
+            subs[chosen].epilog = f"{more} more flags, which most runs leave alone: {HELP_ALL}."
         known += [flag for setting in flags.settings(config_type) for flag in setting.flags]
 
     namespace, unknown = parser.parse_known_args(words)
@@ -266,6 +269,8 @@ def _add_command(subparsers: Any, name: str, command: Command, common: _Parser) 
     sub: _Parser = subparsers.add_parser(
         name, help=command.help, description=description, usage=usage, parents=[common]
     )
+    told = "show this help message with all flags and exit" if command.common else argparse.SUPPRESS
+    sub.add_argument(HELP_ALL, action="help", help=told)
     for argument in command.arguments:
         sub.add_argument(
             _STORED + argument.name,
@@ -277,6 +282,9 @@ def _add_command(subparsers: Any, name: str, command: Command, common: _Parser) 
         )
     return sub
 
+
+HELP_ALL = "--help_all"
+"""Where ``--help`` lists the common flags of a command alone, this lists all."""
 
 _STORED = "positional "
 """Begins the names under which arguments are stored; the blank keeps them apart from those of settings."""

@@ -43,12 +43,15 @@ class Command(NamedTuple):
         function: ``module:function``, called as ``function(*arguments, config, progress)``. It returns a
             :class:`Summary` or None.
         arguments: the words that belong to no flag, in order.
+        common: the flags that ``--help`` lists, without dashes and with blanks between them, and
+            ``--help_all`` the others too; empty: there are no others.
     """
 
     help: str
     config: str
     function: str
     arguments: tuple[Argument, ...] = (WORKSPACE,)
+    common: str = ""
 
 
 class Summary(Protocol):
@@ -64,12 +67,17 @@ COMMANDS: dict[str, Command] = {
         "make depth maps and a fused cloud of a COLMAP workspace",
         "colmap_tco.densify:DensifyConfig",
         "colmap_tco.densify:densify",
+        common="overwrite refine_cameras backbone weights device steps max_image_size mask_path "
+        "min_num_pixels cache_size num_threads min_confidence max_depth_ratio roi voxel_size max_points "
+        "fill_only image_path model_path matcher cameras",
     ),
     "poses": Command(
         "find poses of images from their depth maps (RGB-D, LiDAR): a COLMAP model and a trajectory",
         "colmap_tco.poses:PosesConfig",
         "colmap_tco.poses:poses",
         (Argument("images", "folder of the images"),),
+        "depths depth_unit output_path overwrite steps rough match camera_model camera_params rough_scale "
+        "free_scale backbone weights device",
     ),
     "report": Command(
         "make the page of a finished result anew and open it in the browser",
@@ -112,6 +120,8 @@ COMMANDS: dict[str, Command] = {
         "colmap_tco.bench.command:BenchConfig",
         "colmap_tco.bench.command:bench",
         (),
+        "dataset root setting scenes rows priors output image_width published_settings as_published seed "
+        "overwrite backbone weights device steps",
     ),
     "evaluate": Command(
         "compare a result with true depths, a true cloud or true cameras",

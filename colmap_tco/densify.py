@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class DensifyConfig:
-    """Everything that ``colmap-tco densify`` can be told.
+    """The run as a whole.
 
     What is in ``given`` stands where the network has settings of its own in place of the defaults.
     """

@@ -16,7 +16,7 @@ import difflib
 import math
 import re
 import types
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -152,17 +152,28 @@ def settings(config_type: type) -> tuple[Setting, ...]:
     return tuple(found.values())
 
 
-def add_flags(parser: argparse.ArgumentParser, config_type: type) -> None:
+def add_flags(parser: argparse.ArgumentParser, config_type: type, told: Collection[str] = ()) -> int:
     """Add a flag for every setting, one titled group for every dataclass; one not given sets nothing.
+
+    Args:
+        parser: gets them.
+        config_type: declares them.
+        told: names of those that the help lists; empty: all.
+
+    Returns:
+        How many the help does not list.
 
     Raises:
         TypeError, ValueError: as :func:`settings`.
     """
     groups: dict[type, argparse._ArgumentGroup] = {}
-    for setting in settings(config_type):
+    every = settings(config_type)
+    for setting in every:
         if setting.owner not in groups:
             groups[setting.owner] = parser.add_argument_group(title(setting.owner))
         text = f"{setting.help} (default: {setting.default_word})".replace("%", "%%")
+        if told and setting.name not in told:
+            text = argparse.SUPPRESS
         if setting.base is bool:
             groups[setting.owner].add_argument(
                 *setting.flags,
@@ -181,6 +192,7 @@ def add_flags(parser: argparse.ArgumentParser, config_type: type) -> None:
                 metavar=setting.metavar,
                 help=text,
             )
+    return sum(setting.name not in told for setting in every) if told else 0
 
 
 def title(owner: type) -> str:

@@ -15,7 +15,7 @@ from colmap_tco.commands import COMMANDS, Command
 HEAD = """\
 # All options
 
-Made by `python -m colmap_tco.options_page` from the declarations that `--help` is made of. `_` and `-` are
+Made by `python -m colmap_tco.options_page` from what `--help_all` is made of. `_` and `-` are
 alike in names, `none` and `empty` are no value, `…` is a list separated by commas. Every command also takes
 `-v` (details and tracebacks), `-q` (warnings and errors alone) and `--log_json` (one JSON object a line on
 stderr). A group that several commands have with the same defaults is listed once.

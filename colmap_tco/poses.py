@@ -40,7 +40,7 @@ LEAST_SURFELS = 0.2
 
 @dataclass(frozen=True)
 class PosesConfig:
-    """Everything that ``colmap-tco poses`` can be told."""
+    """Where the depths are, and the run as a whole."""
 
     depths: Path | None = knob(
         None,

@@ -7,6 +7,7 @@ import importlib.util
 import json
 import os
 import pty
+import re
 import struct
 import subprocess
 import sys
@@ -213,6 +214,18 @@ def test_every_command_in_the_table_has_a_configuration_and_a_function(name: str
 
 def _is_there(name: str) -> bool:
     return importlib.util.find_spec(COMMANDS[name].config.partition(":")[0]) is not None
+
+
+@pytest.mark.parametrize("name", [name for name, command in COMMANDS.items() if command.common])
+def test_help_lists_the_common_flags_and_help_all_every_one(name: str) -> None:
+    every = {setting.name for setting in settings(cli._load(COMMANDS[name].config))}
+    common = set(COMMANDS[name].common.split())
+    assert common < every
+    program = "import sys; from colmap_tco.cli import main; sys.exit(main())"
+    short, whole = (run(name, word, program=program).stdout for word in ("--help", "--help-all"))
+    for told, names in ((short, common), (whole, every)):
+        assert set(re.findall(r"^  --(?!help_all|log_json)(\w+)", told, re.M)) == names
+    assert f"{len(every) - len(common)} more flags" in short and "more flags" not in whole
 
 
 def test_version_is_printed() -> None:
