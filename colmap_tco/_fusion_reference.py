@@ -7,7 +7,8 @@ in memory together, so that what is noted of its pixels stays in the thread's ow
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
@@ -169,11 +170,29 @@ class Reference:
     def _fuse(self, pixels: NDArray[np.int64], report: FusionReport) -> list[Cloud]:
         """The points of these pixels (M,), flat indices into the reference, range by range."""
         run = self._shelf.workers
-        merged = self._points([pixels[first : first + _RANGE] for first in range(0, len(pixels), _RANGE)])
+        ranges = [pixels[first : first + _RANGE] for first in range(0, len(pixels), _RANGE)]
+        with closing(self._groups()) as groups:
+            every = next(groups)
+            if len(every) == len(self._neighbours):
+                made = run.map(lambda own: self._at_once(own, every), ranges)
+                _count(report, [points for points, _ in made])
+                return [cloud for _, cloud in made]
+        merged = self._points(ranges)
         for group in self._groups():
             run.map(lambda points, group=group: self._color(points, group), merged)  # type: ignore[misc]
         _count(report, merged)
         return run.map(self._finish, merged)
+
+    def _at_once(self, pixels: NDArray[np.int64], every: Group) -> tuple[_Points, Cloud]:
+        """The points of a range, with all neighbours in memory.
+
+        So what the votes have read of them is still in the cache where colours and marks need it.
+        """
+        part = self._begin(pixels)
+        self._vote(part, every)
+        points = self._merge(part)
+        self._color(points, every)
+        return points, self._finish(points)
 
     def _points(self, ranges: Sequence[NDArray[np.int64]]) -> list[_Points]:
         """The points of ranges of pixels; votes are kept only as long as neighbours are missing."""
@@ -191,7 +210,7 @@ class Reference:
             merged = self._shelf.workers.map(vote, range(len(ranges)))
         return [points for points in merged if points is not None]
 
-    def _groups(self) -> Iterator[Group]:
+    def _groups(self) -> Generator[Group, None, None]:
         """The neighbours, as many at a time as fit into memory."""
         for group in self._shelf.together(self._position, self._neighbours):
             yield [
