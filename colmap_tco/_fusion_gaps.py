@@ -47,7 +47,7 @@ class Covered:
     def mark(
         self,
         position: int,
-        packed: NDArray[np.float32],
+        depth: NDArray[np.float32],
         camera: NDArray[np.float64],
         depth_error: float,
         taken: NDArray[np.uint8],
@@ -57,8 +57,8 @@ class Covered:
 
         Args:
             position: of the view.
-            packed: (H, W, 5) its maps.
-            camera: (6,) of these.
+            depth: (H, W) of it.
+            camera: (6,) of its maps.
             depth_error: relative difference up to which pixel and point are the same surface.
             taken: is changed.
             workers: share the views whose points these are.
@@ -69,6 +69,6 @@ class Covered:
             move = other_from_reference(self._views[position], self._views[other])
             pair = _fusion_kernels.pair(part.camera, camera, move).astype(np.float32)
             every, limits = np.ones(part.points.shape[1], np.uint64), (depth_error, 0.5)
-            _merge_kernels.mark_taken(part.points, every, np.uint64(1), packed, pair, limits, taken)
+            _merge_kernels.mark_taken(part.points, every, np.uint64(1), depth, pair, limits, taken)
 
         workers.map(mark, sorted(self._near[position] & self._parts.keys()))

@@ -13,14 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 KEEP, NO_DEPTH, MASKED, LOW_CONFIDENCE, NO_NORMAL, GRAZING, EDGE, FAR, NOT_FINITE = range(9)
-"""Why a pixel takes no part, as :func:`pack` counts it."""
-
-CHANNELS = 5
-"""A packed view is (H, W, 5): depth, normal x y z, confidence, side by side for they are read together.
-
-A pair is (24,): the six numbers of :func:`camera` of the reference, those of the other view, and the
-(3, 4) transform from the first to the second, row by row.
-"""
+"""Why a pixel takes no part, as :func:`filtered` counts it."""
 
 Maps = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]
 """Depth (H, W), normal (H, W, 3), confidence (H, W), and a mask (H, W) or (0, 0) for none. Kernels take
@@ -40,7 +33,7 @@ def camera(intrinsics: NDArray[np.float64]) -> NDArray[np.float64]:
 def pair(
     ref: NDArray[np.float64], other: NDArray[np.float64], other_from_ref: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Two cameras (6,) and the (3, 4) transform between them, as the loops take them.
+    """Two cameras (6,) and the (3, 4) transform between them, row by row, as the loops take them: (24,).
 
     Arrays alone, because an array that is reached through a tuple inside a loop is counted as in use
     and released there, which takes three times as long as the comparison.
@@ -108,19 +101,19 @@ def _depth_marks(maps: Maps, bounds: Bounds, row: int, marks: NDArray[np.uint8])
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def pack(
+def filtered(
     maps: Maps,
     camera: NDArray[np.float64],
     bounds: Bounds,
     rows: tuple[int, int],
-    packed: NDArray[np.float32],
+    out: NDArray[np.float32],
     counts: NDArray[np.int64],
 ) -> None:
-    """Fill ``rows`` of ``packed`` (H, W, 5), with a depth of 0 where a pixel takes no part.
+    """Fill ``rows`` of ``out`` (H, W) with the depths, and with 0 where a pixel takes no part.
 
     ``counts`` (9,) tells how many pixels have each mark, and how many values are NOT_FINITE.
     """
-    depth, normal, confidence, mask = maps
+    depth, normal, _, mask = maps
     marks = np.empty(depth.shape[1], np.uint8)
     for row in range(rows[0], rows[1]):
         _surface_marks(maps, camera, bounds[2], row, marks)
@@ -133,24 +126,20 @@ def pack(
             z, nx, ny, nz = depth[row, col], normal[row, col, 0], normal[row, col, 1], normal[row, col, 2]
             # The difference of a number that is not finite to itself is no number.
             counts[NOT_FINITE] += (z - z) + (nx - nx) + (ny - ny) + (nz - nz) != 0.0
-            packed[row, col, 0] = z if mark == KEEP else np.float32(0.0)
-            packed[row, col, 1] = nx
-            packed[row, col, 2] = ny
-            packed[row, col, 3] = nz
-            packed[row, col, 4] = confidence[row, col]
+            out[row, col] = z if mark == KEEP else np.float32(0.0)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def free(packed: NDArray[np.float32], taken: NDArray[np.uint8], pixels: NDArray[np.int64]) -> tuple[int, int]:
+def free(depth: NDArray[np.float32], taken: NDArray[np.uint8], pixels: NDArray[np.int64]) -> tuple[int, int]:
     """List the pixels (flat indices, ascending) with a depth that are not taken in ``pixels`` (H W,).
 
     Returns how many these are, and how many pixels have a depth.
     """
-    found, valid, width = 0, 0, packed.shape[1]
-    for row in range(packed.shape[0]):
+    found, valid, width = 0, 0, depth.shape[1]
+    for row in range(depth.shape[0]):
         for col in range(width):
             pixels[found] = row * width + col
-            there = packed[row, col, 0] > 0.0
+            there = depth[row, col] > 0.0
             valid += there
             found += there & (taken[row, col] == 0)
     return found, valid

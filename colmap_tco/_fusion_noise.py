@@ -90,16 +90,16 @@ def _sample(shelf: Shelf, views: Sequence[FusionView], config: FusionConfig) -> 
     blocks = [np.zeros((0, 3))]
     for position in _spread(range(len(views)), _VIEWS):
         ref = shelf.get(position)
-        valid = np.flatnonzero(ref.packed[..., 0])
+        valid = np.flatnonzero(ref.depth)
         pixels = np.ascontiguousarray(valid[:: max(1, len(valid) // _PIXELS)], np.int64)
         tiles = _vote_kernels.tiles_of(len(pixels))
-        _vote_kernels.begin(ref.packed, pixels, tiles)
+        _vote_kernels.begin(ref.surface, pixels, tiles)
         for neighbour in _spread(sorted(views[position].neighbours[: config.check_num_images]), _NEIGHBOURS):
             other = shelf.get(neighbour)
             transform = other_from_reference(views[neighbour], views[position])
             pair = _fusion_kernels.pair(ref.camera, other.camera, transform).astype(np.float32)
             block = np.empty((len(pixels), 3))
-            blocks.append(block[: _vote_kernels.differences(tiles, other.packed, pair, block)])
+            blocks.append(block[: _vote_kernels.differences(tiles, other.surface, pair, block)])
     return np.concatenate(blocks)
 
 

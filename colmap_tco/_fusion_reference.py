@@ -20,7 +20,7 @@ from colmap_tco._fusion_shelf import Shelf, ShelfView
 from colmap_tco.fusion_config import FusionConfig
 from colmap_tco.fusion_input import FusionView, centre, other_from_reference
 from colmap_tco.fusion_report import FusionReport, Tolerance
-from colmap_tco.ply import Cloud, Visibility, join
+from colmap_tco.ply import Cloud, Visibility
 
 _BLOCK_BYTES = 1 << 28
 """Most memory of the votes on those pixels of a reference that are voted on together. So much is needed where
@@ -139,26 +139,28 @@ class Reference:
         for slot, move in enumerate(self._transforms):
             self._centres[slot] = -move[:, :3].T @ move[:, 3]
 
-    def fuse(self, report: FusionReport, noted: Covered | None = None) -> Cloud:
-        """The points of the view; ``report`` tells of its pixels, and ``noted`` is told of its points."""
+    def fuse(self, report: FusionReport, noted: Covered | None = None) -> list[Cloud]:
+        """The points of the view in parts; ``report`` is told of its pixels, and ``noted`` of its points."""
         own = self._own
         for reason, count in own.dropped.items():
             report.pixels[reason] += count
         report.pixels["all"] += own.taken.size
         pixels = np.empty(own.taken.size, np.int64)
-        found, valid = _fusion_kernels.free(own.packed, own.taken, pixels)
+        found, valid = _fusion_kernels.free(own.depth, own.taken, pixels)
         report.pixels["already_fused"] += valid - found - own.dropped.get("max_agreed_error", 0)
         pixels, block = pixels[:found], self._block()
-        cloud = join(
+        clouds = [
             c for first in range(0, found, block) for c in self._fuse(pixels[first : first + block], report)
-        )
+        ]
         if noted is not None:
-            noted.add(self._position, cloud.points, own.camera)
+            points = np.concatenate([np.zeros((0, 3)), *(cloud.points for cloud in clouds)])
+            noted.add(self._position, points, own.camera)
         if self._config.roi:
-            cloud = self._crop(cloud, report)
-        report.points[self._views[self._position].name] = len(cloud)
-        report.pixels["points"] += len(cloud)
-        return cloud
+            clouds = [self._crop(cloud, report) for cloud in clouds]
+        count = sum(map(len, clouds))
+        report.points[self._views[self._position].name] = count
+        report.pixels["points"] += count
+        return clouds
 
     def _crop(self, cloud: Cloud, report: FusionReport) -> Cloud:
         """The points in the region of interest, at the very end, so that the region changes none of them."""
@@ -225,7 +227,7 @@ class Reference:
 
     def _begin(self, pixels: NDArray[np.int64]) -> _Part:
         tiles = _vote_kernels.tiles_of(len(pixels))
-        _vote_kernels.begin(self._own.packed, pixels, tiles)
+        _vote_kernels.begin(self._own.surface, pixels, tiles)
         votes = _vote_kernels.votes_of(len(pixels), len(self._neighbours))
         words = max(1, (len(self._neighbours) + 63) // 64)
         who = np.zeros((words, len(tiles) * _vote_kernels.TILE), np.uint64)
@@ -237,7 +239,7 @@ class Reference:
         limits = (tolerance.depth, tolerance.reproj, cosine, config.sigma_at_one, config.most_depth_error)
         for n in group:
             _vote_kernels.vote(
-                part.tiles, part.votes, n.view.packed, n.maps, limits, n.slot, part.who, part.failed
+                part.tiles, part.votes, n.view.surface, n.maps, limits, n.slot, part.who, part.failed
             )
 
     def _merge(self, part: _Part) -> _Points:
@@ -277,7 +279,7 @@ class Reference:
             if self._neighbours[n.slot] < self._position:
                 continue  # it has been the reference, and will not be again
             limits = self._tolerance.depth, 0.0
-            _merge_kernels.mark_taken(local, who, n.bit, n.view.packed, n.maps, limits, n.view.taken)
+            _merge_kernels.mark_taken(local, who, n.bit, n.view.depth, n.maps, limits, n.view.taken)
 
     def _finish(self, points: _Points) -> Cloud:
         """The points with their colours and visibility."""

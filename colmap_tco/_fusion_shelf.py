@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_tco import _fusion_kernels as kernels
 from colmap_tco._fusion_gaps import Covered
+from colmap_tco._vote_kernels import Surface
 from colmap_tco.fusion_config import FusionConfig
 from colmap_tco.fusion_input import FusionMaps, FusionView
 from colmap_tco.maps import map_intrinsics
@@ -37,7 +38,7 @@ class ShelfView:
     """A view as the kernels take it.
 
     Attributes:
-        packed: (H, W, 5) depth, 0 where it is missing or a filter dropped it; normal; confidence.
+        surface: depth, 0 where it is missing or a filter dropped it; normal and confidence as they were read.
         camera: (6,) of the maps, see :func:`colmap_tco._fusion_kernels.camera`.
         image: (H', W', 3) uint8.
         image_camera: (6,) of ``image``.
@@ -45,7 +46,7 @@ class ShelfView:
         dropped: how many pixels each filter removed.
     """
 
-    packed: NDArray[np.float32]
+    surface: Surface
     camera: NDArray[np.float64]
     image: NDArray[np.uint8]
     image_camera: NDArray[np.float64]
@@ -53,9 +54,14 @@ class ShelfView:
     dropped: dict[str, int]
 
     @property
+    def depth(self) -> NDArray[np.float32]:
+        """(H, W) of ``surface``."""
+        return self.surface[0]
+
+    @property
     def nbytes(self) -> int:
         """Memory of the arrays."""
-        return self.packed.nbytes + self.image.nbytes + self.taken.nbytes
+        return sum(array.nbytes for array in (*self.surface, self.image, self.taken))
 
 
 class Shelf:
@@ -72,7 +78,7 @@ class Shelf:
         workers: Workers,
         covered: tuple[Covered, float] | None = None,
     ) -> None:
-        """Of these views; for ``covered`` see :func:`colmap_tco.fusion.fuse_views`."""
+        """Of these views; for ``covered`` see :func:`colmap_tco.fusion._in_parts`."""
         self.workers = workers
         self._covered = covered
         self._finished = 0
@@ -161,26 +167,26 @@ class Shelf:
         maps = view.load()
         _check_maps(view, maps, self._config)
         shape = maps.depth.shape
-        packed = np.empty((*shape, kernels.CHANNELS), np.float32)
+        depth = np.empty(shape, np.float32)
         camera = kernels.camera(map_intrinsics(view.camera, shape))
         arrays, bounds = _arrays(maps), _bounds(self._config, view, maps)
 
-        def pack(part: slice) -> NDArray[np.int64]:
+        def filtered(part: slice) -> NDArray[np.int64]:
             counts = np.zeros(kernels.NOT_FINITE + 1, np.int64)
-            kernels.pack(arrays, camera, bounds, (part.start, part.stop), packed, counts)
+            kernels.filtered(arrays, camera, bounds, (part.start, part.stop), depth, counts)
             return counts
 
-        counts = np.sum(self.workers.run(shape[0], _ROWS, pack), 0)
+        counts = np.sum(self.workers.run(shape[0], _ROWS, filtered), 0)
         if counts[kernels.NOT_FINITE]:
             raise ValueError(f"{view.name}: depths and normals must be finite; mark missing ones with 0")
         dropped = {name: int(counts[mark]) for name, mark in _MARKS.items()}
         taken = np.zeros(shape, np.uint8)
         if self._covered is not None and position >= self._finished:
-            dropped["max_agreed_error"] = self._start(position, maps, packed, camera, taken)
+            dropped["max_agreed_error"] = self._start(position, maps, depth, camera, taken)
         if position in self._taken:
             taken = np.unpackbits(self._taken.pop(position), count=taken.size).reshape(shape)
         return ShelfView(
-            packed,
+            (depth, arrays[1], arrays[2]),
             camera,
             np.ascontiguousarray(maps.image),
             kernels.camera(map_intrinsics(view.camera, maps.image.shape)),
@@ -192,7 +198,7 @@ class Shelf:
         self,
         position: int,
         maps: FusionMaps,
-        packed: NDArray[np.float32],
+        depth: NDArray[np.float32],
         camera: NDArray[np.float64],
         taken: NDArray[np.uint8],
     ) -> int:
@@ -202,11 +208,11 @@ class Shelf:
             raise ValueError(
                 f"{self._views[position].name}: agreed maps need the standard error of their depths"
             )
-        unsure = (packed[..., 0] > 0) & ~((maps.error > 0) & (maps.error <= self._config.max_agreed_error))
+        unsure = (depth > 0) & ~((maps.error > 0) & (maps.error <= self._config.max_agreed_error))
         taken[unsure] = 1
         if position not in self._taken:
             covered, depth_error = self._covered
-            covered.mark(position, packed, camera, depth_error, taken, self.workers)
+            covered.mark(position, depth, camera, depth_error, taken, self.workers)
         return int(unsure.sum())
 
 

@@ -161,7 +161,7 @@ def mark_taken(
     points: NDArray[np.float32],
     who: NDArray[np.uint64],
     bit: np.uint64,
-    other: NDArray[np.float32],
+    depth: NDArray[np.float32],
     pair: Pair,
     limits: tuple[float, float],
     taken: NDArray[np.uint8],
@@ -173,8 +173,9 @@ def mark_taken(
     same surface seen again; a view that sees it finer than two to one keeps the rest of its pixels, for
     they add detail. Threads may set the same pixel to the same 1.
 
-    ``limits``: relative depth error, and pixels that a point covers at least on each side; if these are 0,
-    the pixel that a point falls into is the same surface whatever its depth.
+    ``depth`` (H, W) is that of the other view. ``limits``: relative depth error, and pixels that a point
+    covers at least on each side; if these are 0, the pixel that a point falls into is the same surface
+    whatever its depth.
     """
     depth_error, least = np.float32(limits[0]), np.float32(limits[1])
     w = np.empty(_SCRATCH, np.float32)
@@ -191,7 +192,7 @@ def mark_taken(
             off, left, right = depth_error * z, np.int32(w[_LEFT + m]), np.int32(w[_RIGHT + m])
             for j in range(np.int32(w[_TOP + m]), np.int32(w[_BOTTOM + m]) + 1):
                 for i in range(left, right + 1):
-                    if abs(other[j, i, 0] - z) <= off:
+                    if abs(depth[j, i] - z) <= off:
                         taken[j, i] = 1
 
 

@@ -55,6 +55,9 @@ UNSEEN, HOLE, OCCLUDED, THROUGH, DEPTH, REPROJECTION, NORMAL, AGREES = range(8)
 _MOST_TILT = 1.05
 """Largest ratio of depths within one pixel that is ascribed to a slanted surface."""
 
+Surface = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+"""Of a view: depth (H, W), 0 where it takes no part; normal (H, W, 3); confidence (H, W)."""
+
 Tiles = NDArray[np.float32]
 Votes = NDArray[np.float32]
 Scratch = NDArray[np.float32]
@@ -77,9 +80,10 @@ def votes_of(count: int, neighbours: int) -> Votes:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def begin(ref: NDArray[np.float32], pixels: NDArray[np.int64], tiles: Tiles) -> None:
-    """Fill ``tiles`` with ``pixels`` (M,), ascending flat indices into the packed view, and no votes."""
-    width, row = ref.shape[1], 0
+def begin(ref: Surface, pixels: NDArray[np.int64], tiles: Tiles) -> None:
+    """Fill ``tiles`` with ``pixels`` (M,), ascending flat indices into the reference, and no votes."""
+    depth, normal, confidence = ref
+    width, row = depth.shape[1], 0
     for t in range(len(tiles)):
         tile = tiles[t]
         for m in range(TILE_SIZE):
@@ -93,8 +97,8 @@ def begin(ref: NDArray[np.float32], pixels: NDArray[np.int64], tiles: Tiles) -> 
             col = pixel - row * width
             tile[ROW + m], tile[COL + m] = row, col
             for channel in range(3):
-                tile[NX + channel * TILE + m] = ref[row, col, 1 + channel]
-            tile[Z + m], tile[CONFIDENCE + m] = ref[row, col, 0], ref[row, col, 4]
+                tile[NX + channel * TILE + m] = normal[row, col, channel]
+            tile[Z + m], tile[CONFIDENCE + m] = depth[row, col], confidence[row, col]
 
 
 @njit(cache=True, error_model="numpy")
@@ -123,18 +127,19 @@ def _locate(tile: NDArray[np.float32], w: Scratch, pair: Pair, width: int, heigh
 
 
 @njit(cache=True, error_model="numpy")
-def _fetch(w: Scratch, other: NDArray[np.float32]) -> None:
-    """Depth, normal and confidence of the other view, (H, W, 5), at the pixels of a tile."""
+def _fetch(w: Scratch, other: Surface) -> None:
+    """Depth, normal and confidence of the other view at the pixels of a tile."""
+    depth, normal, confidence = other
     for m in range(TILE):
         if w[_INSIDE + m] == _0:
             w[_D + m] = _0
             continue
-        pixel = other[np.uint32(w[_J + m]), np.uint32(w[_I + m])]
-        w[_D + m] = pixel[0]
-        w[_N + m] = pixel[1]
-        w[_N + TILE + m] = pixel[2]
-        w[_N + 2 * TILE + m] = pixel[3]
-        w[_C + m] = pixel[4]
+        row, col = np.uint32(w[_J + m]), np.uint32(w[_I + m])
+        w[_D + m] = depth[row, col]
+        w[_N + m] = normal[row, col, 0]
+        w[_N + TILE + m] = normal[row, col, 1]
+        w[_N + 2 * TILE + m] = normal[row, col, 2]
+        w[_C + m] = confidence[row, col]
 
 
 @njit(cache=True, error_model="numpy")
@@ -250,7 +255,7 @@ def _widen(tile: NDArray[np.float32], w: Scratch, pair: Pair) -> None:
 def vote(
     tiles: Tiles,
     votes: Votes,
-    other: NDArray[np.float32],
+    other: Surface,
     pair: Pair,
     limits: Limits,
     slot: int,
@@ -262,14 +267,14 @@ def vote(
     Args:
         tiles: the votes are counted there.
         votes: and noted there.
-        other: (H, W, 5) the neighbour.
+        other: the neighbour.
         pair: the reference and it.
         limits: of what agrees.
         slot: its number.
         who: (words, pixels) gets its bit where it agrees.
         failed: (3,) counts the comparisons that failed by depth, reprojection and normal.
     """
-    height, width = other.shape[0], other.shape[1]
+    height, width = other[0].shape
     bits, bit, at = who[slot >> 6], np.uint64(1) << np.uint64(slot & 63), slot * VOTE_SIZE
     occluded, depth, reprojection = np.float32(OCCLUDED), np.float32(DEPTH), np.float32(REPROJECTION)
     normal, agrees = np.float32(NORMAL), np.float32(AGREES)
@@ -300,7 +305,7 @@ def vote(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def differences(tiles: Tiles, other: NDArray[np.float32], pair: Pair, out: NDArray[np.float64]) -> int:
+def differences(tiles: Tiles, other: Surface, pair: Pair, out: NDArray[np.float64]) -> int:
     """Fill ``out`` (M, 3) with how much a neighbour differs at those pixels of ``tiles`` that it sees.
 
     The columns are the relative depth error, the reprojection error in pixels, and the angle between
@@ -308,7 +313,7 @@ def differences(tiles: Tiles, other: NDArray[np.float32], pair: Pair, out: NDArr
 
     Returns how many rows were filled.
     """
-    height, width, found = other.shape[0], other.shape[1], 0
+    (height, width), found = other[0].shape, 0
     w = np.ones(_SCRATCH, np.float32)
     for t in range(len(tiles)):
         _locate(tiles[t], w, pair, width, height)

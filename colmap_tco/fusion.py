@@ -80,11 +80,11 @@ def fuse(
     report = FusionReport()
 
     def parts() -> Iterator[Cloud]:
-        for part in _filled(views, agreed, config, report) if agreed else fuse_views(views, config, report):
+        for clouds in _filled(views, agreed, config, report) if agreed else _in_parts(views, config, report):
             fused()
-            yield part
+            yield from clouds
 
-    cloud = join(parts())
+    cloud = join(parts(), config.num_threads)
     report.cloud_bytes = cloud.nbytes
     kept = thin(cloud.points, config.voxel_size, config.max_points)
     if len(kept) < len(cloud):
@@ -101,38 +101,49 @@ def fuse(
 
 def _filled(
     views: Sequence[FusionView], agreed: Sequence[FusionView], config: FusionConfig, report: FusionReport
-) -> Iterator[Cloud]:
-    """The clouds of all views, then those that fill the gaps; arguments as of :func:`fuse`."""
+) -> Iterator[list[Cloud]]:
+    """The clouds of all views, then those that fill the gaps, in parts; arguments as of :func:`fuse`."""
     from colmap_tco._fusion_gaps import Covered
 
     covered = Covered(views, config.check_num_images)
-    yield from fuse_views(views, config, report, covered)
+    yield from _in_parts(views, config, report, covered)
     if config.max_agreed_error > 0 and covered:
         assert report.tolerance is not None
         report.gaps = FusionReport()
-        yield from fuse_views(agreed, config, report.gaps, covered=(covered, report.tolerance.depth))
+        yield from _in_parts(agreed, config, report.gaps, covered=(covered, report.tolerance.depth))
 
 
-def fuse_views(
-    views: Sequence[FusionView],
-    config: FusionConfig,
-    report: FusionReport,
-    noted: Covered | None = None,
-    covered: tuple[Covered, float] | None = None,
-) -> Iterator[Cloud]:
+def fuse_views(views: Sequence[FusionView], config: FusionConfig, report: FusionReport) -> Iterator[Cloud]:
     """Fuse view after view: one cloud for each of ``views`` in turn, in the world frame.
 
     Args:
         views: all views; their neighbours are positions in this list.
         config: bounds and filters.
         report: is filled while the clouds are taken.
+
+    Raises:
+        ValueError: neighbours out of range, or arrays of a view that do not fit together.
+    """
+    return map(join, _in_parts(views, config, report))
+
+
+def _in_parts(
+    views: Sequence[FusionView],
+    config: FusionConfig,
+    report: FusionReport,
+    noted: Covered | None = None,
+    covered: tuple[Covered, float] | None = None,
+) -> Iterator[list[Cloud]]:
+    """The clouds of :func:`fuse_views` as they are made, each in parts.
+
+    Args:
+        views: all views.
+        config: bounds and filters.
+        report: is filled while the clouds are taken.
         noted: is told of the points, those outside the region of interest among them.
         covered: the points of a cloud whose gaps are to be filled, and the relative difference of depth up to
             which a pixel shows such a point; if given, the views have standard errors, and pixels that show
             one, or that ``max_agreed_error`` excludes, vote and do not become points.
-
-    Raises:
-        ValueError: neighbours out of range, or arrays of a view that do not fit together.
     """
     from colmap_tco import _fusion_noise
     from colmap_tco._fusion_reference import Bounds, Reference
@@ -147,10 +158,10 @@ def fuse_views(
         log.debug("fusion tolerates %s; means are taken within %.2g of depth and %.2g rad", bounds.tolerance,
                   *bounds.widths)  # fmt: skip
         for position in range(len(views)):
-            cloud = Reference(shelf, views, position, config, bounds).fuse(report, noted)
+            clouds = Reference(shelf, views, position, config, bounds).fuse(report, noted)
             report.loads, report.peak_bytes = shelf.loads, shelf.peak_bytes
             shelf.finish(position)
-            yield cloud
+            yield clouds
 
 
 def _check(views: Sequence[FusionView]) -> None:

@@ -325,10 +325,9 @@ def marked(depths: list[float], focal: float, neighbours: tuple[tuple[int, ...],
     points = np.stack([(column - 24) / 100 * z, 0.5 / 100 * z, z], -1)
     covered.add(0, points, kernels.camera(np.array([focal, focal, 24.0, 4.0])))
     assert covered
-    packed = np.zeros((8, 48, 5), np.float32)
-    packed[..., 0] = 4.0
+    depth = np.full((8, 48), 4.0, np.float32)
     taken = np.zeros((8, 48), np.uint8)
-    covered.mark(1, packed, camera, 0.01, taken, Workers(1))
+    covered.mark(1, depth, camera, 0.01, taken, Workers(1))
     return taken
 
 

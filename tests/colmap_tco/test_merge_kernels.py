@@ -108,7 +108,7 @@ def test_marks_are_the_pixels_within_the_square_and_at_the_depth(
     intrinsics = np.array([focal, focal, 20.0, 16.0])
     chosen = rng.random(points.shape[1]) < 0.6
     taken = np.zeros(depth.shape, np.uint8)
-    other = np.repeat(depth[..., None], 5, 2).astype(np.float32)
+    other = depth.astype(np.float32)
     both = pair(camera(REFERENCE), camera(intrinsics), OTHER_FROM_REFERENCE).astype(np.float32)
     who = np.where(chosen, BIT, np.uint64(0))
     _merge_kernels.mark_taken(points.astype(np.float32), who, BIT, other, both, limits, taken)
