@@ -1,7 +1,8 @@
 """One reference view of :mod:`colmap_tco.fusion` at a time: votes, means, colours, marks, visibility.
 
 The pixels of the reference are split into ranges. A thread takes a range through all neighbours that are
-in memory together, so that what is noted of its pixels stays in the thread's own cache.
+in memory together, and where these are all, through all steps: so what is noted of its pixels, and what is
+read of the neighbours, stays in the thread's own cache.
 """
 
 from __future__ import annotations

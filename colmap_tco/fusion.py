@@ -5,7 +5,7 @@ its depth, moved into the neighbour, meets the surface that the neighbour's dept
 there (``max_depth_error``), that surface point falls back onto the pixel (``max_reproj_error``), and
 the two normals agree (``max_normal_error``). The point is a mean of the agreeing surfaces, weighted by
 confidence and robust (:mod:`colmap_tco._mean_kernels`), and so is its normal; its colour is the median of
-their images. The pixels of the other views that it was made of are not used as references again.
+at most 15 of their images. The pixels of the other views that it was made of are not used as references again.
 
 Where that leaves gaps, the depths that the views agreed on when they were asked for each other's
 (:mod:`tco.consensus`) are fused in the same way. A pixel becomes a point there if the views were hardly
@@ -13,7 +13,7 @@ apart on it (``max_agreed_error``), and if no point of the cloud is there yet; t
 
 Views are loaded when they are needed and kept while they fit ``cache_size``, so that the memory for maps and
 images does not grow with their number. That for the points does: 47 bytes each and 4 for each view that
-agrees (:attr:`colmap_tco.ply.Cloud.nbytes`), 12 more while gaps are filled, and half as much again at the
+agrees (:attr:`colmap_tco.ply.Cloud.nbytes`), 12 more while gaps are filled, and up to as much again at the
 end, when the clouds of all views become one. The result does not depend on the number of threads.
 """
 

@@ -109,7 +109,7 @@ def join(clouds: Iterable[Cloud], num_threads: int = 1) -> Cloud:
     """One cloud of the points of all, in order, copied by some threads (-1: one a core).
 
     Where ``clouds`` is a generator that keeps none, the memory needed is that of the result and of its
-    largest array, or as many arrays as there are threads, once more.
+    largest array, or of as many arrays as there are threads, once more.
     """
     points: list[NDArray[np.float64]] = [np.zeros((0, 3))]
     normals: list[NDArray[np.float32]] = [np.zeros((0, 3), np.float32)]
