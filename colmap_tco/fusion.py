@@ -5,7 +5,7 @@ its depth, moved into the neighbour, meets the surface that the neighbour's dept
 there (``max_depth_error``), that surface point falls back onto the pixel (``max_reproj_error``), and
 the two normals agree (``max_normal_error``). The point is a mean of the agreeing surfaces, weighted by
 confidence and robust (:mod:`colmap_tco._mean_kernels`), and so is its normal; its colour is the median of
-at most 15 of their images. The pixels of the other views that it was made of are not used as references again.
+their images, at most 15. The pixels of the other views that it was made of are not used as references again.
 
 Where that leaves gaps, the depths that the views agreed on when they were asked for each other's
 (:mod:`tco.consensus`) are fused in the same way. A pixel becomes a point there if the views were hardly
