@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from shutil import which
 from typing import Any
 
 import numpy as np
@@ -142,6 +143,8 @@ def stereo_fusion(made: Made) -> tuple[int, str]:
 
 def openmvs(made: Made) -> tuple[int, str]:
     """OpenMVS' fusion of the depth and normal maps, after its importer has read the export."""
+    if which("InterfaceCOLMAP") is None:
+        raise ImportError("OpenMVS is not installed")
     out = made.folder / "openmvs"
     command("export", "openmvs", made.workspace, "-o", out)
     side = max(read_map(made.dense.paths.depth_map(made.dense.views[0].name)).shape)
@@ -205,7 +208,7 @@ def lines(made: Made) -> Iterator[str]:
     for name, trip in TRIPS.items():
         try:
             count, said = trip(made)
-        except (ImportError, FileNotFoundError) as error:
+        except ImportError as error:
             yield f"| {name} | | not measured: {error} |"
             continue
         yield f"| {name} | {len(made.points)} → {count} | {said} |"

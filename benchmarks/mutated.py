@@ -184,6 +184,8 @@ MUTATIONS = [
             ("colmap_tco/_merge_kernels.py", "p += a *", "p += b *"),
             ("colmap_tco/_merge_kernels.py", "+ cy - _HALF, _0), bottom)", "+ cy, _0), bottom)"),
             ("colmap_tco/_merge_kernels.py", "channel[have >> 1, m]", "channel[have >> 2, m]"),
+            ("colmap_tco/_merge_kernels.py", "(w[_Z + m] > _0) & (u >= _0)", "(u >= _0)"),
+            ("colmap_tco/_merge_kernels.py", "or not w[_Z + m] > _0", ""),
             ("colmap_tco/_merge_kernels.py", "_REACH * min(w[_SIZE + m], _2)", "_REACH * w[_SIZE + m]"),
             ("colmap_tco/_merge_kernels.py", "abs(depth[j, i] - z) <= off", "depth[j, i] - z <= off"),
             ("colmap_tco/_fusion_shelf.py", "self._last[p] <= position", "self._last[p] < position"),

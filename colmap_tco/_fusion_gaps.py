@@ -67,7 +67,7 @@ class Covered:
         def mark(other: int) -> None:
             part = self._parts[other]
             move = other_from_reference(self._views[position], self._views[other])
-            pair = _fusion_kernels.pair(part.camera, camera, move).astype(np.float32)
+            pair = _fusion_kernels.pair(part.camera, camera, move)
             every, limits = np.ones(part.points.shape[1], np.uint64), (depth_error, 0.5)
             _merge_kernels.mark_taken(part.points, every, np.uint64(1), depth, pair, limits, taken)
 

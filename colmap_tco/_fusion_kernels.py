@@ -32,23 +32,13 @@ def camera(intrinsics: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def pair(
     ref: NDArray[np.float64], other: NDArray[np.float64], other_from_ref: NDArray[np.float64]
-) -> NDArray[np.float64]:
+) -> NDArray[np.float32]:
     """Two cameras (6,) and the (3, 4) transform between them, row by row, as the loops take them: (24,).
 
     Arrays alone, because an array that is reached through a tuple inside a loop is counted as in use
     and released there, which takes three times as long as the comparison.
     """
-    return np.concatenate([ref, other, other_from_ref.ravel()])
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def move(pair: NDArray[np.float64], x: float, y: float, z: float) -> tuple[float, float, float]:
-    """A point of the first camera in the second."""
-    return (
-        pair[12] * x + pair[13] * y + pair[14] * z + pair[15],
-        pair[16] * x + pair[17] * y + pair[18] * z + pair[19],
-        pair[20] * x + pair[21] * y + pair[22] * z + pair[23],
-    )
+    return np.concatenate([ref, other, other_from_ref.ravel()]).astype(np.float32)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -111,9 +101,10 @@ def filtered(
 ) -> None:
     """Fill ``rows`` of ``out`` (H, W) with the depths, and with 0 where a pixel takes no part.
 
-    ``counts`` (9,) tells how many pixels have each mark, and how many values are NOT_FINITE.
+    ``counts`` (9,) tells how many pixels have each mark, and how many hold a value that is NOT_FINITE,
+    or a confidence that is not above 0.
     """
-    depth, normal, _, mask = maps
+    depth, normal, confidence, mask = maps
     marks = np.empty(depth.shape[1], np.uint8)
     for row in range(rows[0], rows[1]):
         _surface_marks(maps, camera, bounds[2], row, marks)
@@ -124,8 +115,10 @@ def filtered(
                 mark = np.uint8(MASKED)
             counts[mark] += 1
             z, nx, ny, nz = depth[row, col], normal[row, col, 0], normal[row, col, 1], normal[row, col, 2]
+            sure = confidence[row, col]
             # The difference of a number that is not finite to itself is no number.
-            counts[NOT_FINITE] += (z - z) + (nx - nx) + (ny - ny) + (nz - nz) != 0.0
+            wrong = (z - z) + (nx - nx) + (ny - ny) + (nz - nz) != 0.0
+            counts[NOT_FINITE] += wrong | ((mark == KEEP) & ((sure <= 0.0) | (sure - sure != 0.0)))
             out[row, col] = z if mark == KEEP else np.float32(0.0)
 
 

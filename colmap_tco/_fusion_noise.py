@@ -97,7 +97,7 @@ def _sample(shelf: Shelf, views: Sequence[FusionView], config: FusionConfig) -> 
         for neighbour in _spread(sorted(views[position].neighbours[: config.check_num_images]), _NEIGHBOURS):
             other = shelf.get(neighbour)
             transform = other_from_reference(views[neighbour], views[position])
-            pair = _fusion_kernels.pair(ref.camera, other.camera, transform).astype(np.float32)
+            pair = _fusion_kernels.pair(ref.camera, other.camera, transform)
             block = np.empty((len(pixels), 3))
             blocks.append(block[: _vote_kernels.differences(tiles, other.surface, pair, block)])
     return np.concatenate(blocks)

@@ -72,6 +72,9 @@ class _Neighbour:
 Group = list[_Neighbour]
 """Neighbours that are in memory together."""
 
+Lost = tuple[NDArray[np.int64], NDArray[np.int64]]
+"""Of a range: ``failed`` of :class:`_Part` and ``removed`` of :class:`_Points`."""
+
 
 @dataclass(frozen=True)
 class _Part:
@@ -178,16 +181,16 @@ class Reference:
             every = next(groups)
             if len(every) == len(self._neighbours):
                 made = run.map(lambda own: self._at_once(own, every), ranges)
-                _count(report, [points for points, _ in made])
+                _count(report, [lost for lost, _ in made])
                 return [cloud for _, cloud in made]
         merged = self._points(ranges)
         for group in self._groups():
             run.map(lambda points, group=group: self._color(points, group), merged)  # type: ignore[misc]
-        _count(report, merged)
+        _count(report, [(points.failed, points.removed) for points in merged])
         return run.map(self._finish, merged)
 
-    def _at_once(self, pixels: NDArray[np.int64], every: Group) -> tuple[_Points, Cloud]:
-        """The points of a range, with all neighbours in memory.
+    def _at_once(self, pixels: NDArray[np.int64], every: Group) -> tuple[Lost, Cloud]:
+        """The points of a range, with all neighbours in memory, and what failed.
 
         So what the votes have read of them is still in the cache where colours and marks need it.
         """
@@ -195,7 +198,7 @@ class Reference:
         self._vote(part, every)
         points = self._merge(part)
         self._color(points, every)
-        return points, self._finish(points)
+        return (points.failed, points.removed), self._finish(points)
 
     def _points(self, ranges: Sequence[NDArray[np.int64]]) -> list[_Points]:
         """The points of ranges of pixels; votes are kept only as long as neighbours are missing."""
@@ -214,12 +217,20 @@ class Reference:
         return [points for points in merged if points is not None]
 
     def _groups(self) -> Generator[Group, None, None]:
-        """The neighbours, as many at a time as fit into memory."""
-        for group in self._shelf.together(self._position, self._neighbours):
-            yield [
+        """The neighbours, as many at a time as fit into memory; each list is emptied before the next.
+
+        Whoever still has the list would otherwise keep views that the shelf has dropped.
+        """
+        for held in self._shelf.together(self._position, self._neighbours):
+            group = [
                 _Neighbour(slot, view, self._pair(slot, view.camera), self._pair(slot, view.image_camera))
-                for slot, view in group
+                for slot, view in held
             ]
+            held.clear()
+            try:
+                yield group
+            finally:
+                group.clear()
 
     def _block(self) -> int:
         """Pixels that are voted on together."""
@@ -265,10 +276,12 @@ class Reference:
         tile = _vote_kernels.TILE
         slots = min(_COLOR_SAMPLES, 1 + len(self._neighbours))
         samples, sampled = np.empty((-(-count // tile), slots, 3, tile), np.uint8), np.zeros(count, np.uint8)
-        pair = _fusion_kernels.pair(own.camera, own.image_camera, np.eye(3, 4)).astype(np.float32)
+        pair = _fusion_kernels.pair(own.camera, own.image_camera, np.eye(3, 4))
         every, bit = np.ones(count, np.uint64), np.uint64(1)
         _merge_kernels.sample_colors(means[0], every, bit, pair, own.image, samples, sampled)
-        return _Points(part.who[:, kept], part.failed, supports, *means, samples, sampled, removed)
+        return _Points(
+            np.ascontiguousarray(part.who[:, kept]), part.failed, supports, *means, samples, sampled, removed
+        )
 
     def _color(self, points: _Points, group: Group) -> None:
         """Sample the colours of a group's images, and mark as taken the pixels that a point is made of."""
@@ -296,15 +309,15 @@ class Reference:
 
     def _pair(self, slot: int, camera: NDArray[np.float64]) -> NDArray[np.float32]:
         """The reference and the neighbour in this slot, of which ``camera`` is the map's or the image's."""
-        return _fusion_kernels.pair(self._own.camera, camera, self._transforms[slot]).astype(np.float32)
+        return _fusion_kernels.pair(self._own.camera, camera, self._transforms[slot])
 
 
-def _count(report: FusionReport, merged: Sequence[_Points]) -> None:
+def _count(report: FusionReport, lost: Sequence[Lost]) -> None:
     """Add up what became of the pixels of a block."""
-    failed = np.sum([np.zeros(3, np.int64), *(points.failed for points in merged)], 0)
+    failed = np.sum([np.zeros(3, np.int64), *(of_range for of_range, _ in lost)], 0)
     for name, number in zip(report.comparisons, failed.tolist(), strict=True):
         report.comparisons[name] += number
-    removed = np.sum([np.zeros(4, np.int64), *(points.removed for points in merged)], 0).tolist()
+    removed = np.sum([np.zeros(4, np.int64), *(of_range for _, of_range in lost)], 0).tolist()
     for name, number in zip(("max_conflicts", "min_num_pixels", "min_tri_angle"), removed, strict=False):
         report.pixels[name] += number
     report.lowered += removed[3]

@@ -178,7 +178,10 @@ class Shelf:
 
         counts = np.sum(self.workers.run(shape[0], _ROWS, filtered), 0)
         if counts[kernels.NOT_FINITE]:
-            raise ValueError(f"{view.name}: depths and normals must be finite; mark missing ones with 0")
+            raise ValueError(
+                f"{view.name}: depths, normals and confidences must be finite, confidences above 0; "
+                "mark missing depths and normals with 0"
+            )
         dropped = {name: int(counts[mark]) for name, mark in _MARKS.items()}
         taken = np.zeros(shape, np.uint8)
         if self._covered is not None and position >= self._finished:

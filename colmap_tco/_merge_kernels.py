@@ -133,7 +133,7 @@ def median_colors(samples: NDArray[np.uint8], count: NDArray[np.uint8], out: NDA
                     row[m] = tile[n, c, m] if last < counts[m] else np.uint8(255)
             _sort(channel)
             for m in range(number):
-                have = np.uint32(counts[m])
+                have = max(np.uint32(counts[m]), np.uint32(1))
                 low, high = channel[(have - np.uint32(1)) >> 1, m], channel[have >> 1, m]
                 out[first + m, c] = np.uint8((np.uint32(low) + np.uint32(high) + np.uint32(1)) >> 1)
 

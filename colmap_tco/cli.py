@@ -237,9 +237,10 @@ def _parse(words: list[str], commands: Mapping[str, Command]) -> tuple[str, list
     parser = _Parser(
         prog="colmap-tco",
         description="The dense step after COLMAP, by test-time constrained optimisation.",
-        epilog="Flags may be spelt with _ or -. 'colmap-tco COMMAND --help' lists those of a command.",
+        epilog="Flags may be spelt with _ or -. 'colmap-tco COMMAND --help' tells those of a command.",
         parents=[common],
     )
+    parser.add_argument(HELP_ALL, action="help", help=argparse.SUPPRESS)
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     subs = {name: _add_command(subparsers, name, command, common) for name, command in commands.items()}

@@ -13,8 +13,8 @@ apart on it (``max_agreed_error``), and if no point of the cloud is there yet; t
 
 Views are loaded when they are needed and kept while they fit ``cache_size``, so that the memory for maps and
 images does not grow with their number. That for the points does: 47 bytes each and 4 for each view that
-agrees (:attr:`colmap_tco.ply.Cloud.nbytes`), 12 more while gaps are filled, and up to as much again at the
-end, when the clouds of all views become one. The result does not depend on the number of threads.
+agrees (:attr:`colmap_tco.ply.Cloud.nbytes`), 12 more while gaps are filled, and two thirds as much again at
+the end, when the clouds of all views become one. The result does not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def fuse(
             fused()
             yield from clouds
 
-    cloud = join(parts(), config.num_threads)
+    cloud = join(parts(), 1 if config.num_threads == 1 else 2)
     report.cloud_bytes = cloud.nbytes
     kept = thin(cloud.points, config.voxel_size, config.max_points)
     if len(kept) < len(cloud):

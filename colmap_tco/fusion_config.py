@@ -39,7 +39,7 @@ class FusionConfig:
     cache_size: float = knob(
         4.0,
         "Gigabytes of maps and images kept in memory (COLMAP: 32). More saves reading when views are many. "
-        "The points come on top, with some 100 bytes each.",
+        "The points come on top, with some 130 bytes each.",
     )
     num_threads: int = knob(-1, "Threads of all stages; -1 is one a core.")
     min_confidence: float = knob(

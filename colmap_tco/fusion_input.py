@@ -46,7 +46,8 @@ class FusionView:
         camera: pinhole of the undistorted image.
         cam_from_world: (3, 4) or (4, 4) float64.
         neighbours: positions in the list of views that is fused, the best overlapping first.
-        load: reads the arrays; called again if they had to leave the cache.
+        load: reads the arrays; called again if they had to leave the cache. They are kept, not copied, and
+            must not change afterwards.
         reach: depth that hardly a point of the model exceeds in this view, for ``max_depth_ratio``.
         sure: confidence of depths that were confirmed before: ``max_depth_bend`` leaves them; inf: of none.
     """

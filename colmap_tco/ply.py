@@ -106,10 +106,10 @@ class Cloud:
 
 
 def join(clouds: Iterable[Cloud], num_threads: int = 1) -> Cloud:
-    """One cloud of the points of all, in order, copied by some threads (-1: one a core).
+    """One cloud of the points of all, in order, copied by some threads.
 
-    Where ``clouds`` is a generator that keeps none, the memory needed is that of the result and of its
-    largest array, or of as many arrays as there are threads, once more.
+    Where ``clouds`` is a generator that keeps none, the memory needed is that of the result and, once more,
+    of as many of its largest arrays as there are threads.
     """
     points: list[NDArray[np.float64]] = [np.zeros((0, 3))]
     normals: list[NDArray[np.float32]] = [np.zeros((0, 3), np.float32)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -12,7 +13,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial import cKDTree
 
 from colmap_tco import _fusion_noise
-from colmap_tco._fusion_shelf import Shelf
+from colmap_tco._fusion_shelf import Shelf, ShelfView
 from colmap_tco.errors import DensifyError
 from colmap_tco.fusion import FusionConfig, FusionMaps, FusionView, fuse, fuse_views
 from colmap_tco.fusion_report import FILTERS, FusionReport, Tolerance
@@ -340,17 +341,30 @@ def test_threads_and_repetition_give_identical_bytes(monkeypatch: pytest.MonkeyP
     assert fused_bytes(views, replace(CONFIG, num_threads=5)) == whole
 
 
-def test_a_small_cache_gives_the_same_cloud_in_bounded_memory() -> None:
+def test_a_small_cache_gives_the_same_cloud_in_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the report, and by the views that anything holds: one more than fits while the next is read."""
     views = noisy_views()
     whole = fused_bytes(views)
     _, generous = fuse(views, CONFIG)
-    one = generous.peak_bytes / len(views)
-    for held in (1.0, 3.5):
+    one, made, most = generous.peak_bytes / len(views), list[weakref.ref[ShelfView]](), 0
+
+    def prepare(shelf: Shelf, position: int) -> ShelfView:
+        nonlocal most
+        view = read(shelf, position)
+        made.append(weakref.ref(view))
+        most = max(most, sum(ref() is not None for ref in made))
+        return view
+
+    read = Shelf._prepare
+    monkeypatch.setattr(Shelf, "_prepare", prepare)
+    for held in (1.0, 3.5, 5.2):
+        most = 0
         config = replace(CONFIG, cache_size=held * one / 1e9)
         assert fused_bytes(views, config) == whole
         _, report = fuse(views, config)
         assert report.peak_bytes <= max(held, 2) * one
         assert report.loads > generous.loads == len(views)
+        assert most <= max(int(held), 2) + 1
 
 
 def test_the_report_tells_the_memory_of_the_points() -> None:
@@ -581,6 +595,23 @@ def test_refuses_maps_that_do_not_fit(change: Callable[[FusionMaps], FusionMaps]
     views[1] = with_maps(views[1], change)
     with pytest.raises(ValueError, match=r"1\.jpg"):
         fuse(views, CONFIG)
+
+
+@pytest.mark.parametrize("wrong", [0.0, np.nan, np.inf])
+def test_confidences_must_be_numbers_above_zero_where_a_pixel_takes_part(wrong: float) -> None:
+    def with_confidence(where: tuple[int, int]) -> list[FusionView]:
+        def change(maps: FusionMaps) -> FusionMaps:
+            confidence, depth = np.full(maps.depth.shape, 5.0, np.float32), maps.depth.copy()
+            confidence[where], depth[0, 0] = wrong, 0.0
+            return replace(maps, confidence=confidence, depth=depth)
+
+        return [with_maps(view, change) for view in Scene().views()]
+
+    config = replace(CONFIG, min_confidence=0.0)
+    cloud, _ = fuse(with_confidence((0, 0)), config)
+    assert np.isfinite(cloud.points).all()
+    with pytest.raises(ValueError, match="confidences above 0"):
+        fuse(with_confidence((30, 40)), config)
 
 
 def test_confidence_that_is_asked_for_must_be_there() -> None:
