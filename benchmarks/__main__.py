@@ -52,7 +52,7 @@ class Table:
 
 _ALL = ("--sets", "kitchen", "office", "livingroom", *SCENES)
 _RENDERED = ("--sets", *SCENES)
-_THREE = ("--seeds", "3")
+_TWO, _THREE = ("--seeds", "2"), ("--seeds", "3")
 
 TABLES = (
     Table("quality", "quality", "quality.md", (*_ALL, "--baselines", "interp", "patchmatch")),
@@ -61,8 +61,8 @@ TABLES = (
     Table("quality-steps", "quality", "quality.md",
           ("--baselines", "--steps", "10", "20", "40"), "more steps"),
     Table("claim", "claim", "claim.md", _THREE),
-    Table("claim-hills", "claim", "claim.md", ("--seeds", "2", "--sets", "hills", "knots"), "hills and knots"),
-    Table("claim-walk", "claim", "claim.md", ("--seeds", "2", "--sets", "walk", "temple"), "walk and temple"),
+    Table("claim-hills", "claim", "claim.md", (*_TWO, "--sets", "hills", "knots"), "hills and knots"),
+    Table("claim-walk", "claim", "claim.md", (*_TWO, "--sets", "walk", "temple"), "walk and temple"),
     Table("ablations", "ablations", "ablations.md", (*_THREE, "--steps", "12")),
     Table("ablations-rendered", "ablations", "ablations.md", (*_THREE, "--steps", "12", *_RENDERED),
           "rendered scenes"),
