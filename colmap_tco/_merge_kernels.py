@@ -46,16 +46,12 @@ def _move(points: NDArray[np.float32], first: int, count: int, pair: Pair, w: Sc
 
 
 @njit(cache=True, error_model="numpy")
-def _between(
-    count: int, camera: tuple[float, float, float, float], shape: tuple[int, int], w: Scratch
-) -> None:
+def _between(count: int, pair: Pair, shape: tuple[int, int], w: Scratch) -> None:
     """The upper left of the four pixels of an image that a point lies between, at most the last but one.
 
     Clamped to the border, so that what is outside has the colour there.
     """
-    fx, fy, cx, cy = (
-        np.float32(camera[0]), np.float32(camera[1]), np.float32(camera[2]), np.float32(camera[3])
-    )  # fmt: skip
+    fx, fy, cx, cy = pair[6], pair[7], pair[8], pair[9]
     right, bottom = np.float32(shape[1] - 1), np.float32(shape[0] - 1)
     for m in range(count):
         u = min(max(fx * w[_X + m] + cx - _HALF, _0), right)
@@ -88,7 +84,7 @@ def sample_colors(
     for first in range(0, points.shape[1], TILE):
         number = min(TILE, points.shape[1] - first)
         _move(points, first, number, pair, w)
-        _between(number, (pair[6], pair[7], pair[8], pair[9]), (height, width), w)
+        _between(number, pair, (height, width), w)
         tile = samples[first // TILE]
         for m in range(number):
             n = count[first + m]
@@ -140,7 +136,7 @@ def median_colors(samples: NDArray[np.uint8], count: NDArray[np.uint8], out: NDA
 
 @njit(cache=True, error_model="numpy")
 def _cover(count: int, pair: Pair, shape: tuple[int, int], least: np.float32, w: Scratch) -> None:
-    """The pixel of the other view that a point falls into, and those that it covers; none if outside."""
+    """The pixel of the other view that a point falls into, column −1 if none, and those that it covers."""
     fx, fy, cx, cy = pair[6], pair[7], pair[8], pair[9]
     height, width = np.float32(shape[0]), np.float32(shape[1])
     for m in range(count):
@@ -149,11 +145,9 @@ def _cover(count: int, pair: Pair, shape: tuple[int, int], least: np.float32, w:
         reach = max(_REACH * min(w[_SIZE + m], _2), least)
         left, top = np.ceil(u - reach - _HALF), np.ceil(v - reach - _HALF)
         right, bottom = np.floor(u + reach - _HALF), np.floor(v + reach - _HALF)
-        w[_I + m], w[_J + m] = np.floor(u), np.floor(v)
+        w[_I + m], w[_J + m] = np.floor(u) if inside else -_1, np.floor(v)
         w[_LEFT + m], w[_TOP + m] = max(left, _0), max(top, _0)
-        w[_RIGHT + m] = min(right, width - _1) if inside else -_1
-        w[_BOTTOM + m] = min(bottom, height - _1)
-        w[_I + m] = w[_I + m] if inside else -_1
+        w[_RIGHT + m], w[_BOTTOM + m] = min(right, width - _1), min(bottom, height - _1)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -54,7 +54,7 @@ def test_colours_are_those_between_four_pixels(shape: tuple[int, int]) -> None:
     samples = np.zeros((4, 2, 3, TILE), np.uint8)
     count = rng.integers(0, 3, points.shape[1]).astype(np.uint8)
     before = count.copy()
-    both = pair(camera(REFERENCE), camera(intrinsics), OTHER_FROM_REFERENCE).astype(np.float32)
+    both = pair(camera(REFERENCE), camera(intrinsics), OTHER_FROM_REFERENCE)
     _merge_kernels.sample_colors(points.astype(np.float32), who, BIT, both, image, samples, count)
     (u, v), z = projected(points, intrinsics)
     added = chosen & (z > 0) & (before < 2)
@@ -110,7 +110,7 @@ def test_marks_are_the_pixels_within_the_square_and_at_the_depth(
     chosen = rng.random(points.shape[1]) < 0.6
     taken = np.zeros(depth.shape, np.uint8)
     other = depth.astype(np.float32)
-    both = pair(camera(REFERENCE), camera(intrinsics), OTHER_FROM_REFERENCE).astype(np.float32)
+    both = pair(camera(REFERENCE), camera(intrinsics), OTHER_FROM_REFERENCE)
     who = np.where(chosen, BIT, np.uint64(0))
     _merge_kernels.mark_taken(points.astype(np.float32), who, BIT, other, both, limits, taken)
     want = covered(points[:, chosen], depth, intrinsics, limits)
