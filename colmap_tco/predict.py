@@ -90,8 +90,8 @@ def predict_chunk(
         InputError: the points do not project where the keypoints are, or an image cannot be read.
     """
     from tco.align import CameraPenalties, KnownCameras
-    from tco.consensus import agreed
     from tco.optimize import errors_at_points, optimize
+    from tco.planar.run import together
 
     (backbone, device), (prior_config, tco_config, consensus, seed) = network, settings
     penalties = CameraPenalties.of(tco_config)
@@ -112,8 +112,9 @@ def predict_chunk(
         watched=[points.to(device) for points in priors.held_out],
     )
     assert priors.optimise.sparse is not None
-    together = agreed(outcome.prediction, outcome.cameras, there, priors.optimise, consensus).to("cpu")
-    own, prediction, moved = outcome.prediction.to("cpu"), together.prediction, outcome.cameras.to("cpu")
+    flat = together(outcome.prediction, outcome.cameras, there, priors.optimise, consensus, seed)
+    prediction, error = flat.agreement.prediction, flat.agreement.error
+    own, moved = outcome.prediction.to("cpu"), outcome.cameras.to("cpu")
     used = errors_at_points(prediction, priors.optimise.sparse)
     held = errors_at_points(prediction, priors.held_out)
     results = {}
@@ -130,9 +131,10 @@ def predict_chunk(
             "error_of_one_depth": _error_of_one_depth(priors.optimise.sparse[i].depth),
             "reprojection_error_pixels": check.per_view.get(view.name),
             "correction": _correction(outcome, i, frame.scale),
+            "on_planes": float((flat.labels[i] > 0)[images.valid[i]].float().mean()),
         }
         corrected = corrected_view(view, frame.scale, cameras, moved, i)
-        maps = view_maps(view, prediction, i, images.valid, frame.scale, together.error, num_threads)
+        maps = view_maps(view, prediction, i, images.valid, frame.scale, error, num_threads)
         before = view_maps(view, own, i, images.valid, frame.scale, num_threads=num_threads)
         results[view.name] = ViewResult(maps, before, figures | _asked(before, maps), corrected)
     if aligned is not None:

@@ -75,19 +75,21 @@ class Scene:
         prediction: Prediction,
         cameras: Cameras | None = None,
         config: ConsensusConfig = ConsensusConfig(),
+        seed: int = 0,
     ) -> Agreement:
-        """What the V views say together of the depths: what ``densify`` writes as maps.
+        """What the V views say together of the depths, planes among them: what ``densify`` writes as maps.
 
         Args:
             prediction: of all V views, each by itself.
             cameras: where they stand; by default as in the priors, ``Outcome.cameras`` knows better.
             config: settings.
+            seed: of the planes that are drawn.
         """
-        from tco.consensus import agreed
+        from tco.planar.run import together
 
         cameras = cameras or self.priors.cameras
         assert cameras is not None
-        return agreed(prediction, cameras, self.views, self.priors, config)
+        return together(prediction, cameras, self.views, self.priors, config, seed).agreement
 
     def fuse(
         self,

@@ -110,7 +110,10 @@ class PolishConfig:
 
 @dataclass(frozen=True)
 class ConsensusConfig:
-    """What the views say together (``tco/consensus.py``): no optimisation, and without steps, too."""
+    """What the views say together (``tco/consensus.py``), and the planes that they show (``tco/planar``).
+
+    No optimisation, and without steps, too.
+    """
 
     consensus_rounds: int = knob(
         2,
@@ -133,8 +136,28 @@ class ConsensusConfig:
         "views are not asked where the standard deviations of the cameras move pixels by more than this "
         "share of the longer side: what others see is then elsewhere",
     )
+    planes: int = knob(
+        20,
+        "planes at most of each group of views, onto which depths are moved where they are unsure or nearly "
+        "on one: plain walls, floors, cupboards; 0: none",
+    )
+    plane_share: float = knob(0.003, "share of all pixels, by their confidence, that a plane must explain")
+    plane_trust: float = knob(
+        5.0,
+        "most that it costs a pixel to be moved off a depth that is sure; raise it where things that are "
+        "nearly flat are flattened",
+    )
+    plane_smoothness: float = knob(
+        2.0,
+        "cost of a step in depth, and of a plane's border, per pixel of its length in pictures of 256 "
+        "pixels; raise it for larger planes with straighter borders",
+    )
 
     def __post_init__(self) -> None:
+        if self.planes < 0 or not 0 < self.plane_share < 1:
+            raise ValueError("planes must not be negative, and plane_share between 0 and 1")
+        if self.plane_trust <= 0 or self.plane_smoothness < 0:
+            raise ValueError("plane_trust must be positive, and plane_smoothness not negative")
         if self.consensus_rounds < 0 or self.consensus_views < 1:
             raise ValueError("consensus_rounds must not be negative, and consensus_views at least 1")
         if not (self.consensus_reach > 0 and self.consensus_width > 0):

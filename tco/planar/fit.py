@@ -1,0 +1,190 @@
+"""Planes of the depths of many views: found among their pixels, and fitted to those that took them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tco.options import ConsensusConfig
+from tco.planar.view import Bools, Floats, Labels, Plane, Shown, normals
+
+LEAST, MOST = 0.01, 0.1
+"""Bounds of the relative error of a depth that is compared with a plane: no confidence makes it smaller, and
+depths that are worse do not show a plane."""
+SURE = 30.0
+"""Confidence above 1 from which on a pixel counts no more than others."""
+ANGLES = (12.0, 40.0)
+"""Degrees between the normals of a pixel and of its plane, at most, for the least and the largest error."""
+SAMPLES, DRAWN, JUDGES = 30_000, 300, 8_000
+"""Pixels of all views among which planes are sought, planes that are drawn for each that is found, and pixels
+that judge them."""
+FEWEST = 50
+"""Pixels that make a plane."""
+STEPS = 5
+"""Of each robust fit."""
+ALIKE = 6e-4
+"""Share of a view that errs as one: a plane's covariance is of so many independent errors, not of pixels."""
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """N pixels of any views: points (N, 3), unit normals (N, 3), depths, bounded errors, weights (N,)."""
+
+    points: Floats
+    normals: Floats
+    depth: Floats
+    error: Floats
+    weight: Floats
+
+    def __getitem__(self, keep: Bools | Labels) -> _Pixels:
+        return _Pixels(
+            self.points[keep], self.normals[keep], self.depth[keep], self.error[keep], self.weight[keep]
+        )
+
+    def near(self, normal: Floats, offset: Floats | float, times: float = 1.0) -> Bools:
+        """Which pixels (N,) are on a plane (3,), or (N, P) on planes (3, P), by place and by normal."""
+        share = ((self.error - LEAST) / (MOST - LEAST)).clip(0, 1)
+        least = np.cos(np.radians(ANGLES[0] + (ANGLES[1] - ANGLES[0]) * share))
+        allowed, depth = times * self.error, self.depth
+        if normal.ndim == 2:
+            least, allowed, depth = least[:, None], allowed[:, None], depth[:, None]
+        far = np.abs(self.points @ normal - offset)
+        return np.asarray((far < allowed * depth) & (self.normals @ normal > least))
+
+
+def bounded(error: Floats) -> Floats:
+    """Errors as they are compared with planes."""
+    return error.clip(LEAST, MOST)
+
+
+def find(views: Sequence[Shown], config: ConsensusConfig, rng: np.random.Generator) -> list[Plane]:
+    """The planes that explain most of the depths, the best first; none twice.
+
+    Args:
+        views: with their depths.
+        config: how many planes at most, and how much each must explain.
+        rng: draws them.
+    """
+    pixels = _drawn(views, rng)
+    total, found = float(pixels.weight.sum()), list[Plane]()
+    while len(found) < config.planes and len(pixels.depth) >= FEWEST and total > 0:
+        best = _best(pixels, rng)
+        normal, offset, on = _robust(pixels, *best)
+        if on.sum() < FEWEST or pixels.weight[on].sum() < config.plane_share * total:
+            break
+        found.append(_plane(pixels[on], normal, offset, np.zeros((3, 3))))
+        pixels = pixels[~pixels.near(normal, offset, 1.5)]
+    return found
+
+
+def _drawn(views: Sequence[Shown], rng: np.random.Generator) -> _Pixels:
+    """Pixels that have a normal, at random from all views."""
+    parts = []
+    for view in views:
+        n = normals(view)
+        there = np.flatnonzero((n != 0).any(-1) & (view.sure > 0))
+        pick = rng.permutation(there)[: -(-SAMPLES // len(views))]
+        parts.append(
+            (view.points.reshape(-1, 3)[pick], n.reshape(-1, 3)[pick], view.depth.ravel()[pick],
+             bounded(view.error.ravel()[pick]), view.sure.ravel()[pick].clip(0, SURE))
+        )  # fmt: skip
+    return _Pixels(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def _best(pixels: _Pixels, rng: np.random.Generator) -> tuple[Floats, float]:
+    """Normal and offset of the best of some planes through a pixel each."""
+    chance = pixels.weight.astype(np.float64)
+    drawn = pixels[rng.choice(len(chance), DRAWN, p=chance / chance.sum())]
+    judges = pixels[rng.permutation(len(chance))[:JUDGES]]
+    offsets = (drawn.points * drawn.normals).sum(-1)
+    votes = judges.weight @ judges.near(drawn.normals.T, offsets)
+    first = int(votes.argmax())
+    return drawn.normals[first], float(offsets[first])
+
+
+def _robust(pixels: _Pixels, normal: Floats, offset: float) -> tuple[Floats, float, Bools]:
+    """The plane fitted to the pixels near it, and which these are, some times."""
+    on = pixels.near(normal, offset, 1.5)
+    for _ in range(STEPS):
+        if on.sum() < FEWEST:
+            break
+        near = pixels[on]
+        weight = near.weight / near.depth**2
+        normal, offset = _least_squares(near.points, weight, normal)
+        on = pixels.near(normal, offset, 1.5)
+    return normal, offset, on
+
+
+def _least_squares(points: Floats, weight: Floats, like: Floats) -> tuple[Floats, float]:
+    """The plane of least weighted square distances from points (N, 3), its normal on the side of ``like``."""
+    points, weight = points.astype(np.float64), weight.astype(np.float64)
+    mean = weight @ points / weight.sum()
+    centred = points - mean
+    normal = np.linalg.eigh(centred.T @ (weight[:, None] * centred))[1][:, 0]
+    normal = normal if normal @ like > 0 else -normal
+    return normal.astype(np.float32), float(normal @ mean)
+
+
+def _plane(pixels: _Pixels, normal: Floats, offset: float, covariance: Floats) -> Plane:
+    """With a centre in the middle of pixels and two axes."""
+    axis = np.eye(3, dtype=np.float32)[int(np.abs(normal).argmin())]
+    u = np.cross(normal, axis)
+    u /= np.linalg.norm(u)
+    centre = pixels.weight @ pixels.points / max(float(pixels.weight.sum()), 1e-12)
+    return Plane(normal, offset, centre, np.stack([u, np.cross(normal, u)]), covariance)
+
+
+def refit(
+    views: Sequence[Shown], labels: Sequence[Labels], planes: Sequence[Plane], config: ConsensusConfig,
+    shown: int,
+) -> list[Plane]:  # fmt: skip
+    """Planes fitted to the pixels that took them, with covariances; those that too few took are gone.
+
+    Args:
+        views: that were labelled.
+        labels: (H, W) of each, plane k as k + 1.
+        planes: that they could take.
+        config: share of all pixels that a plane needs.
+        shown: number of all views, of which these are some.
+    """
+    total, found = sum(label.size for label in labels), list[Plane]()
+    for k, plane in enumerate(planes):
+        parts = []
+        for view, label in zip(views, labels, strict=True):
+            on = (label == k + 1) & view.known
+            n = np.broadcast_to(plane.normal, (int(on.sum()), 3))
+            parts.append((view.points[on], n, view.depth[on], view.error[on], view.sure[on].clip(0, SURE)))
+        pixels = _Pixels(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+        if len(pixels.depth) < max(FEWEST, config.plane_share * total) or not (pixels.weight > 0).any():
+            continue
+        normal, offset = plane.normal, plane.offset
+        for _ in range(STEPS):
+            off = (pixels.points @ normal - offset) / pixels.depth / bounded(pixels.error)
+            weight = pixels.weight / pixels.depth**2 / (1 + off**2) ** 2
+            normal, offset = _least_squares(pixels.points, weight, normal)
+        fitted = _plane(pixels, normal, offset, np.zeros((3, 3)))
+        stands_for = shown / len(views) / (ALIKE * labels[0].size)
+        found.append(_with_covariance(fitted, pixels, stands_for))
+    return found
+
+
+def _with_covariance(plane: Plane, pixels: _Pixels, stands_for: float) -> Plane:
+    """The plane with the covariance of its least squares on pixels near it.
+
+    Args:
+        plane: fitted to them.
+        pixels: with errors that are bounded below alone.
+        stands_for: number of independent errors that a pixel stands for, less than 1.
+    """
+    off = np.abs(pixels.points @ plane.normal - plane.offset) / pixels.depth
+    near = pixels[off < 3 * bounded(pixels.error)]
+    if not len(near.depth):
+        near = pixels
+    at = np.concatenate([(near.points - plane.centre) @ plane.axes.T, np.ones((len(near.depth), 1))], -1)
+    information = stands_for / (near.error.clip(LEAST) * near.depth).astype(np.float64) ** 2
+    normal_equations = at.T @ (information[:, None] * at)
+    normal_equations += 1e-9 * information.sum() * np.eye(3)
+    covariance = np.linalg.inv(normal_equations)
+    return Plane(plane.normal, plane.offset, plane.centre, plane.axes, covariance)

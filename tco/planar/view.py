@@ -1,0 +1,133 @@
+"""What planes are sought in and drawn into: a view with its depths, and a plane."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from tco.geometry import pixel_grid, rays
+from tco.types import Cameras, Prediction, Views
+
+Floats = NDArray[np.floating[Any]]
+Bools = NDArray[np.bool_]
+Labels = NDArray[np.int64]
+
+ERROR = 0.05
+"""Relative error that a depth of confidence 2 is taken to have; with confidence c it is this over c − 1."""
+SIDE = 222.0
+"""Root of the number of pixels of the views that settings were chosen for: borders count relative to it."""
+REACH = 3.0
+"""Pixels to each side over which normals are taken, in views of that size."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """One view, perhaps at a lower resolution.
+
+    Attributes:
+        depth: (H, W), 1 where there is none.
+        sure: (H, W) confidence above 1, 0 where there is no depth.
+        known: (H, W) where there is a depth that counts.
+        image: (H, W, 3) colours in [0, 1].
+        directions: (H, W, 3) of the pixels' rays in the world, of unit depth.
+        centre: (3,) of the camera in the world.
+    """
+
+    depth: Floats
+    sure: Floats
+    known: Bools
+    image: Floats
+    directions: Floats
+    centre: Floats
+
+    @property
+    def points(self) -> Floats:
+        """(H, W, 3) in the world."""
+        return self.centre + self.directions * self.depth[..., None]
+
+    @property
+    def error(self) -> Floats:
+        """Relative error (H, W) that depths are taken to have."""
+        return ERROR / self.sure.clip(1e-3)
+
+    @property
+    def side(self) -> float:
+        """Root of the number of pixels."""
+        return math.sqrt(self.depth.size)
+
+
+def shown(prediction: Prediction, cameras: Cameras, views: Views, i: int, stride: int = 1) -> Shown:
+    """View ``i`` at every ``stride``-th of its pixels, colours averaged over as many."""
+    h, w = (size // stride * stride for size in views.size)
+    pick = slice(stride // 2, h, stride), slice(stride // 2, w, stride)
+    depth, confidence = prediction.depth[i].float(), prediction.confidence[i].float()
+    known = views.valid[i] & torch.isfinite(depth) & (depth > 0)
+    depth = depth.where(known, torch.ones_like(depth))
+    sure = (confidence - 1).clamp_min(0) * known
+    ray = rays(pixel_grid(*views.size, depth).reshape(-1, 2), cameras.K[i].float()).reshape(*views.size, 3)
+    pose = cameras.world_from_cam[i].float()
+    image = views.images[i, :, :h, :w].float().permute(1, 2, 0)
+    image = image.reshape(h // stride, stride, w // stride, stride, 3).mean((1, 3))
+    return Shown(
+        depth[pick].numpy(), sure[pick].numpy(), known[pick].numpy(), image.numpy(),
+        (ray @ pose[:3, :3].T)[pick].numpy(), pose[:3, 3].numpy(),
+    )  # fmt: skip
+
+
+def normals(view: Shown) -> Floats:
+    """(H, W, 3) of the surface, over some pixels to each side; zeros at borders and beside unknown depths."""
+    h, w = view.depth.shape
+    r = max(1, round(REACH * view.side / SIDE))
+    found = np.zeros((h, w, 3), np.float32)
+    if min(h, w) <= 2 * r:
+        return found
+    rows, columns = slice(r, h - r), slice(r, w - r)
+    points, known = view.points, view.known
+    across = points[rows, 2 * r :] - points[rows, : -2 * r]
+    down = points[2 * r :, columns] - points[: -2 * r, columns]
+    n = np.cross(across, down)
+    n /= np.linalg.norm(n, axis=-1, keepdims=True).clip(1e-12)
+    there = known[rows, columns] & known[rows, 2 * r :] & known[rows, : -2 * r]
+    there &= known[2 * r :, columns] & known[: -2 * r, columns]
+    found[rows, columns] = n * there[..., None]
+    return found
+
+
+@dataclass(frozen=True)
+class Plane:
+    """The plane n·X = d of the world, and how well it is known.
+
+    Attributes:
+        normal: (3,) n, of length one.
+        offset: d.
+        centre: (3,) mean of the pixels that it was fitted to.
+        axes: (2, 3) directions in the plane.
+        covariance: (3, 3) of (a, b, c), where the plane's error at centre + u axes[0] + v axes[1] is
+            a u + b v + c along n; zeros before the first fit to labels.
+    """
+
+    normal: Floats
+    offset: float
+    centre: Floats
+    axes: Floats
+    covariance: Floats
+
+    def depth(self, view: Shown) -> Floats:
+        """Depth (H, W) of the plane at the pixels of a view, 0 where it is behind the camera."""
+        along = view.directions @ self.normal
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = (self.offset - view.centre @ self.normal) / along
+        return np.where((depth > 0) & np.isfinite(depth), depth, 0).astype(np.float32)
+
+    def error(self, view: Shown, depth: Floats) -> Floats:
+        """Relative standard error (H, W) of these depths of the plane, by its covariance."""
+        points = view.centre + view.directions * depth[..., None] - self.centre
+        at = np.concatenate([points @ self.axes.T, np.ones((*depth.shape, 1))], -1)
+        variance = np.einsum("hwi,ij,hwj->hw", at, self.covariance, at)
+        along = np.abs(view.directions @ self.normal).clip(1e-6)
+        return np.sqrt(variance.clip(0)) / along / depth.clip(1e-6)
