@@ -77,6 +77,7 @@ TABLES = (
     Table("scaling-rendered", "scaling", "scaling.md", (*_THREE, *_RENDERED), "rendered scenes"),
     Table("tco_step", "tco_step", "tco_step.md", ("--threads", "1", "--cpu_time")),
     Table("consensus", "consensus", "consensus.md"),
+    Table("planes", "planes", "planes.md"),
     Table("calibration", "calibration", "calibration.md"),
     Table("poses", "poses", "poses.md", ("--exact",)),
     Table("render", "render", "render.md"),
