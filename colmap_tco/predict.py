@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from tco.backbones.base import Backbone
+    from tco.consensus import Agreement
     from tco.optimize import Outcome
     from tco.types import Cameras, Prediction
 
@@ -136,7 +137,8 @@ def predict_chunk(
         corrected = corrected_view(view, frame.scale, cameras, moved, i)
         maps = view_maps(view, prediction, i, images.valid, frame.scale, error, num_threads)
         before = view_maps(view, own, i, images.valid, frame.scale, num_threads=num_threads)
-        results[view.name] = ViewResult(maps, before, figures | _asked(before, maps), corrected)
+        figures |= _asked(own.depth[i], flat.before, i, images.valid[i])
+        results[view.name] = ViewResult(maps, before, figures, corrected)
     if aligned is not None:
         steps = [
             terms | {f"own_{k}": v for k, v in more.items()}
@@ -146,14 +148,14 @@ def predict_chunk(
     return ChunkResult(results, outcome.history, {})
 
 
-def _asked(before: ViewMaps, after: ViewMaps) -> dict[str, float | None]:
-    """By how much, relative, the other views moved the depths of a view, and of what share enough spoke."""
-    known = (before.depth > 0) & (after.depth > 0)
-    moved = np.abs(np.log(after.depth[known] / before.depth[known]))
-    assert after.error is not None
+def _asked(own: Tensor, together: Agreement, i: int, valid: Tensor) -> dict[str, object]:
+    """By how much, relative, others moved the depths of view ``i``, and of what share enough spoke."""
+    after, spread = together.prediction.depth[i], together.error[i]
+    known = valid & (own > 0) & (after > 0)
+    moved = (after[known] / own[known]).log().abs()
     return {
-        "moved_by_consensus": float(np.median(moved)) if moved.size else None,
-        "asked_by_consensus": float((after.error > 0).mean()),
+        "moved_by_consensus": _median(moved),
+        "asked_by_consensus": float(torch.isfinite(spread)[valid].float().mean()),
     }
 
 

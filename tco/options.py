@@ -118,7 +118,7 @@ class ConsensusConfig:
     consensus_rounds: int = knob(
         2,
         "times that each pixel's depth is moved to the weighted median of what the views say of it, each "
-        "with its own depths; 0: the depths of a view are its own alone",
+        "with its own depths; 0: the depths of a view are its own alone, not on planes either",
     )
     consensus_views: int = knob(20, "views that a pixel asks, those that share the most points")
     consensus_reach: float = knob(
@@ -141,15 +141,17 @@ class ConsensusConfig:
         "planes at most of each group of views, onto which depths are moved where they are unsure or nearly "
         "on one: plain walls, floors, cupboards; 0: none",
     )
-    plane_share: float = knob(0.003, "share of all pixels, by their confidence, that a plane must explain")
+    plane_share: float = knob(
+        0.003, "share of all pixels that a plane needs: by their confidence when it is found, by number later"
+    )
     plane_trust: float = knob(
         5.0,
-        "most that it costs a pixel to be moved off a depth that is sure; raise it where things that are "
-        "nearly flat are flattened",
+        "most that it costs a pixel to be moved far off its depth, as reckoned by its error; raise it where "
+        "things that are nearly flat are flattened",
     )
     plane_smoothness: float = knob(
         2.0,
-        "cost of a step in depth, and of a plane's border, per pixel of its length in pictures of 256 "
+        "cost of a step in depth, and of a plane's border, per pixel of its length in pictures of 256 × 192 "
         "pixels; raise it for larger planes with straighter borders",
     )
 

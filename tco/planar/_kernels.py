@@ -44,11 +44,17 @@ def _send(
         out: where the message goes.
     """
     weight, tau, kappa = terms
+    cheapest = np.float32(np.inf)
+    for k in range(len(mine)):
+        cheapest = min(cheapest, mine[k] - back[k])
+    most = np.float32(cheapest + weight * (1 + kappa))  # whatever the two labels, a border costs no more
     least = np.float32(np.inf)
     for k in range(len(mine)):
-        best = np.float32(np.inf)
+        best = most
         for j in range(len(mine)):
-            best = min(best, mine[j] - back[j] + weight * step_cost(j, k, logs, others, tau, kappa))
+            own = mine[j] - back[j]
+            if own < best:
+                best = min(best, own + weight * step_cost(j, k, logs, others, tau, kappa))
         out[k] = best
         least = min(least, best)
     for k in range(len(mine)):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -20,38 +20,61 @@ ANGLES = (12.0, 40.0)
 SAMPLES, DRAWN, JUDGES = 30_000, 300, 8_000
 """Pixels of all views among which planes are sought, planes that are drawn for each that is found, and pixels
 that judge them."""
+GRAZING = 0.5
+"""Least cosine, but for the length of the ray, between a ray and a normal that is reckoned with: depths err
+more where a surface is seen at a flat angle, about by as much as less of it is across the surface."""
 FEWEST = 50
 """Pixels that make a plane."""
 STEPS = 5
 """Of each robust fit."""
-ALIKE = 6e-4
+ALIKE = 1.2e-3
 """Share of a view that errs as one: a plane's covariance is of so many independent errors, not of pixels."""
 
 
 @dataclass(frozen=True)
 class _Pixels:
-    """N pixels of any views: points (N, 3), unit normals (N, 3), depths, bounded errors, weights (N,)."""
+    """N pixels of any views: points, normals, directions of rays (N, 3), depths, errors, weights (N,)."""
 
     points: Floats
     normals: Floats
+    directions: Floats
     depth: Floats
     error: Floats
     weight: Floats
 
     def __getitem__(self, keep: Bools | Labels) -> _Pixels:
         return _Pixels(
-            self.points[keep], self.normals[keep], self.depth[keep], self.error[keep], self.weight[keep]
-        )
+            self.points[keep], self.normals[keep], self.directions[keep], self.depth[keep],
+            self.error[keep], self.weight[keep],
+        )  # fmt: skip
+
+    @staticmethod
+    def of(view: Shown, on: Bools | Labels, normals: Floats) -> _Pixels:
+        """Some of a view's pixels, whose normals are given."""
+        points, directions = view.points.reshape(-1, 3)[on], view.directions.reshape(-1, 3)[on]
+        depth, error, sure = view.depth.ravel()[on], view.error.ravel()[on], view.sure.ravel()[on]
+        return _Pixels(points, normals, directions, depth, error, sure.clip(0, SURE))
+
+    @staticmethod
+    def joined(parts: Sequence[_Pixels]) -> _Pixels:
+        """All of them, one after the other."""
+        names = [field.name for field in fields(_Pixels)]
+        return _Pixels(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+    def across(self, normal: Floats) -> Floats:
+        """Length along n, (N,) or (N, P), by which a relative error of depth of 1 is off a plane."""
+        depth = self.depth if normal.ndim == 1 else self.depth[:, None]
+        return np.asarray(depth * np.abs(self.directions @ normal).clip(GRAZING))
 
     def near(self, normal: Floats, offset: Floats | float, times: float = 1.0) -> Bools:
         """Which pixels (N,) are on a plane (3,), or (N, P) on planes (3, P), by place and by normal."""
-        share = ((self.error - LEAST) / (MOST - LEAST)).clip(0, 1)
+        share = (bounded(self.error) - LEAST) / (MOST - LEAST)
         least = np.cos(np.radians(ANGLES[0] + (ANGLES[1] - ANGLES[0]) * share))
-        allowed, depth = times * self.error, self.depth
+        allowed = times * bounded(self.error)
         if normal.ndim == 2:
-            least, allowed, depth = least[:, None], allowed[:, None], depth[:, None]
+            least, allowed = least[:, None], allowed[:, None]
         far = np.abs(self.points @ normal - offset)
-        return np.asarray((far < allowed * depth) & (self.normals @ normal > least))
+        return np.asarray((far < allowed * self.across(normal)) & (self.normals @ normal > least))
 
 
 def bounded(error: Floats) -> Floats:
@@ -59,15 +82,18 @@ def bounded(error: Floats) -> Floats:
     return error.clip(LEAST, MOST)
 
 
-def find(views: Sequence[Shown], config: ConsensusConfig, rng: np.random.Generator) -> list[Plane]:
-    """The planes that explain most of the depths, the best first; none twice.
+def find(
+    views: Iterable[Shown], count: int, config: ConsensusConfig, rng: np.random.Generator
+) -> list[Plane]:
+    """The planes that explain most of the depths, the best first; a wavy one may come twice.
 
     Args:
-        views: with their depths.
+        views: with their depths; one at a time is kept.
+        count: of the views.
         config: how many planes at most, and how much each must explain.
         rng: draws them.
     """
-    pixels = _drawn(views, rng)
+    pixels = _drawn(views, count, rng)
     total, found = float(pixels.weight.sum()), list[Plane]()
     while len(found) < config.planes and len(pixels.depth) >= FEWEST and total > 0:
         best = _best(pixels, rng)
@@ -79,18 +105,15 @@ def find(views: Sequence[Shown], config: ConsensusConfig, rng: np.random.Generat
     return found
 
 
-def _drawn(views: Sequence[Shown], rng: np.random.Generator) -> _Pixels:
-    """Pixels that have a normal, at random from all views."""
+def _drawn(views: Iterable[Shown], count: int, rng: np.random.Generator) -> _Pixels:
+    """Pixels that have a normal, at random from all ``count`` views, which are read one by one."""
     parts = []
     for view in views:
         n = normals(view)
         there = np.flatnonzero((n != 0).any(-1) & (view.sure > 0))
-        pick = rng.permutation(there)[: -(-SAMPLES // len(views))]
-        parts.append(
-            (view.points.reshape(-1, 3)[pick], n.reshape(-1, 3)[pick], view.depth.ravel()[pick],
-             bounded(view.error.ravel()[pick]), view.sure.ravel()[pick].clip(0, SURE))
-        )  # fmt: skip
-    return _Pixels(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+        pick = rng.permutation(there)[: -(-SAMPLES // count)]
+        parts.append(_Pixels.of(view, pick, n.reshape(-1, 3)[pick]))
+    return _Pixels.joined(parts)
 
 
 def _best(pixels: _Pixels, rng: np.random.Generator) -> tuple[Floats, float]:
@@ -111,7 +134,7 @@ def _robust(pixels: _Pixels, normal: Floats, offset: float) -> tuple[Floats, flo
         if on.sum() < FEWEST:
             break
         near = pixels[on]
-        weight = near.weight / near.depth**2
+        weight = near.weight / near.across(normal) ** 2
         normal, offset = _least_squares(near.points, weight, normal)
         on = pixels.near(normal, offset, 1.5)
     return normal, offset, on
@@ -137,9 +160,8 @@ def _plane(pixels: _Pixels, normal: Floats, offset: float, covariance: Floats) -
 
 
 def refit(
-    views: Sequence[Shown], labels: Sequence[Labels], planes: Sequence[Plane], config: ConsensusConfig,
-    shown: int,
-) -> list[Plane]:  # fmt: skip
+    views: Sequence[Shown], labels: Sequence[Labels], planes: Sequence[Plane], config: ConsensusConfig
+) -> list[Plane]:
     """Planes fitted to the pixels that took them, with covariances; those that too few took are gone.
 
     Args:
@@ -147,43 +169,41 @@ def refit(
         labels: (H, W) of each, plane k as k + 1.
         planes: that they could take.
         config: share of all pixels that a plane needs.
-        shown: number of all views, of which these are some.
     """
-    total, found = sum(label.size for label in labels), list[Plane]()
+    total, found = sum(int(view.known.sum()) for view in views), list[Plane]()
     for k, plane in enumerate(planes):
         parts = []
         for view, label in zip(views, labels, strict=True):
-            on = (label == k + 1) & view.known
-            n = np.broadcast_to(plane.normal, (int(on.sum()), 3))
-            parts.append((view.points[on], n, view.depth[on], view.error[on], view.sure[on].clip(0, SURE)))
-        pixels = _Pixels(*(np.concatenate(part) for part in zip(*parts, strict=True)))
-        if len(pixels.depth) < max(FEWEST, config.plane_share * total) or not (pixels.weight > 0).any():
+            on = np.flatnonzero((label == k + 1) & (view.sure > 0))
+            parts.append(_Pixels.of(view, on, np.broadcast_to(plane.normal, (len(on), 3))))
+        pixels = _Pixels.joined(parts)
+        if len(pixels.depth) < max(FEWEST, config.plane_share * total):
             continue
         normal, offset = plane.normal, plane.offset
         for _ in range(STEPS):
-            off = (pixels.points @ normal - offset) / pixels.depth / bounded(pixels.error)
-            weight = pixels.weight / pixels.depth**2 / (1 + off**2) ** 2
+            across = pixels.across(normal)
+            off = (pixels.points @ normal - offset) / across / bounded(pixels.error)
+            weight = pixels.weight / across**2 / (1 + off**2) ** 2
             normal, offset = _least_squares(pixels.points, weight, normal)
         fitted = _plane(pixels, normal, offset, np.zeros((3, 3)))
-        stands_for = shown / len(views) / (ALIKE * labels[0].size)
-        found.append(_with_covariance(fitted, pixels, stands_for))
+        found.append(_with_covariance(fitted, pixels, 1 / (ALIKE * labels[0].size)))
     return found
 
 
 def _with_covariance(plane: Plane, pixels: _Pixels, stands_for: float) -> Plane:
-    """The plane with the covariance of its least squares on pixels near it.
+    """The plane with the covariance that the errors of pixels near it allow, if they weigh by these.
 
     Args:
         plane: fitted to them.
-        pixels: with errors that are bounded below alone.
-        stands_for: number of independent errors that a pixel stands for, less than 1.
+        pixels: with errors that are not bounded.
+        stands_for: number of independent errors that a pixel stands for.
     """
-    off = np.abs(pixels.points @ plane.normal - plane.offset) / pixels.depth
+    off = np.abs(pixels.points @ plane.normal - plane.offset) / pixels.across(plane.normal)
     near = pixels[off < 3 * bounded(pixels.error)]
     if not len(near.depth):
         near = pixels
     at = np.concatenate([(near.points - plane.centre) @ plane.axes.T, np.ones((len(near.depth), 1))], -1)
-    information = stands_for / (near.error.clip(LEAST) * near.depth).astype(np.float64) ** 2
+    information = stands_for / (near.error.clip(LEAST) * near.across(plane.normal)).astype(np.float64) ** 2
     normal_equations = at.T @ (information[:, None] * at)
     normal_equations += 1e-9 * information.sum() * np.eye(3)
     covariance = np.linalg.inv(normal_equations)

@@ -26,7 +26,7 @@ STEP, CHANGE = 0.1, 0.1
 BINS, UNLIKE, MOST_UNLIKE, SHRINK = 8, 0.3, 3.0, 2e-3
 """Bins of each channel; weight of how much rarer a colour is on the plane than in the view, in powers of e;
 the most that counts; share of a view, in sure pixels, that makes the colours of a plane known."""
-NEVER = 50.0
+NEVER = 1e3
 """Cost of what cannot be: a plane behind the camera, or one where there is no depth."""
 SWEEPS = 3
 """Passes of messages there and back."""
@@ -47,7 +47,7 @@ def labelled(view: Shown, planes: Sequence[Plane], config: ConsensusConfig) -> L
     for k, plane in enumerate(planes):
         depth = plane.depth(view)
         cost = _cost(view, plane, depth, colours, config)
-        if (cost < WORTH * config.plane_trust).mean() >= FEW:
+        if ((cost < WORTH * config.plane_trust) & (cost < NEVER)).mean() >= FEW:
             tried.append(k + 1)
             costs.append(cost)
             logs.append(np.log(np.where(depth > 0, depth, 1)))
@@ -92,13 +92,13 @@ def rarity(colours: Labels, sure: Floats, near: Floats) -> Floats:
     every, here = (_histogram(colours, weight / total) for weight in (sure, sure * near))
     share = float(here.sum())
     ratio = (here + SHRINK * every) / (share + SHRINK) / every.clip(1e-9)
-    return np.asarray((-np.log(ratio.clip(1e-9))).clip(0, MOST_UNLIKE))
+    return np.where(every > 1e-6, -np.log(ratio.clip(1e-9)), 0).clip(0, MOST_UNLIKE)
 
 
 def _histogram(colours: Labels, weights: Floats) -> Floats:
     """Sums of weights (H, W) per bin, blurred a little, (BINS³,)."""
     counts = np.bincount(colours.ravel(), weights.ravel().astype(np.float64), BINS**3)
-    return np.asarray(gaussian_filter(counts.reshape(BINS, BINS, BINS), 0.7, mode="nearest").ravel())
+    return np.asarray(gaussian_filter(counts.reshape(BINS, BINS, BINS), 0.7, mode="reflect").ravel())
 
 
 def borders(view: Shown, smoothness: float) -> tuple[Floats, Floats]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,15 +16,22 @@ from tco.consensus import Agreement, agreed
 from tco.options import ConsensusConfig
 from tco.planar.fit import find, refit
 from tco.planar.label import labelled
-from tco.planar.view import Plane, shown
+from tco.planar.view import Plane, Shown, shown
 from tco.polish import too_uncertain
 from tco.types import Cameras, Prediction, Priors, Views
 
 ROUNDS = 3
 """How often pixels are labelled and planes fitted again."""
-EVERY, SHOWN = 3, 12
-"""Every so many views take part in that, but not more than so many, at half their size; all are labelled in
-the end."""
+SHARED = 3.0
+"""Views' worth of pixels that this is done with: many views take part at a lower resolution each, never at
+more than half of it. In the end all are labelled at their own."""
+LARGEST = 200_000
+"""Pixels at most that are labelled at once; labels of larger views are coarser, their depths are not. This
+bounds memory, at 1 kB a pixel and thread for 20 planes, and time."""
+WORKERS = 8
+"""Threads at most."""
+SMALLEST = 16
+"""Pixels of the shorter side of a view in which planes are sought."""
 
 
 @dataclass(frozen=True)
@@ -30,12 +39,15 @@ class OnPlanes:
     """Depths of which some are those of planes.
 
     Attributes:
-        agreement: with these depths, on the CPU.
+        agreement: with these depths, on the CPU. Where a depth was moved by a factor e^m, its standard
+            error s has become √(s² + m²): it is still how far the views are from what is said now.
+        before: the agreement without planes.
         planes: that were found.
         labels: (V, H, W) 0 where a pixel kept its depth, else the number of its plane, from 1.
     """
 
     agreement: Agreement
+    before: Agreement
     planes: tuple[Plane, ...]
     labels: Tensor
 
@@ -59,11 +71,11 @@ def together(
     """
     agreement = agreed(prediction, cameras, views, priors, config).to("cpu")
     consequence = "depths are not moved onto planes (--consensus_uncertainty)"
-    if config.planes == 0 or (
+    if config.consensus_rounds == 0 or (
         priors.cameras is not None
         and too_uncertain(priors, views.size, config.consensus_uncertainty, consequence)
     ):
-        return OnPlanes(agreement, (), torch.zeros_like(agreement.error, dtype=torch.int64))
+        config = replace(config, planes=0)
     return flattened(agreement, cameras.to("cpu"), views.to("cpu"), config, seed)
 
 
@@ -81,21 +93,43 @@ def flattened(
         seed: of the planes that are drawn.
     """
     prediction, count = agreement.prediction, len(views)
-    full = [shown(prediction, cameras, views, i) for i in range(count)]
-    planes = find(full, config, np.random.default_rng(seed))
-    some = [shown(prediction, cameras, views, i, 2) for i in range(0, count, max(EVERY, -(-count // SHOWN)))]
-    wanted = [full[i] for i in views.wanted]
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+    chosen = torch.zeros_like(prediction.depth, dtype=torch.int64)
+    if config.planes == 0 or min(views.size) < SMALLEST:
+        return OnPlanes(agreement, agreement, (), chosen)
+    show = partial(shown, prediction, cameras, views)
+    planes = find(map(show, range(count)), count, config, np.random.default_rng(seed))
+    stride = min(max(2, math.ceil(math.sqrt(count / SHARED))), min(views.size) // SMALLEST)
+    some = [show(i, stride) for i in range(count)]
+    with ThreadPoolExecutor(min(torch.get_num_threads(), WORKERS)) as pool:
         for _ in range(ROUNDS):
             labels = list(pool.map(partial(labelled, planes=planes, config=config), some))
-            planes = refit(some, labels, planes, config, count)
-        labels = list(pool.map(partial(labelled, planes=planes, config=config), wanted))
-    depth = prediction.depth.clone()
-    chosen = torch.zeros_like(depth, dtype=torch.int64)
-    for i, view, label in zip(views.wanted, wanted, labels, strict=True):
-        chosen[i] = torch.from_numpy(label)
-        for k, plane in enumerate(planes):
-            on = chosen[i] == k + 1
-            depth[i] = torch.from_numpy(plane.depth(view)).to(depth).where(on, depth[i])
-    moved = replace(agreement, prediction=replace(prediction, depth=depth))
-    return OnPlanes(moved, tuple(planes), chosen)
+            planes = refit(some, labels, planes, config)
+        of_view = partial(_view_on_planes, agreement, show, planes, config)
+        results = list(pool.map(of_view, views.wanted))
+    depth, error = prediction.depth.clone(), agreement.error.clone()
+    for i, (flat, spread, label) in zip(views.wanted, results, strict=True):
+        depth[i], error[i], chosen[i] = flat, spread, label
+    moved = Agreement(replace(prediction, depth=depth), error)
+    return OnPlanes(moved, agreement, tuple(planes), chosen)
+
+
+def _view_on_planes(
+    agreement: Agreement, show: Callable[..., Shown], planes: Sequence[Plane], config: ConsensusConfig, i: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Depth, standard error and labels (H, W) of one view."""
+    view = show(i)
+    stride = math.ceil(math.sqrt(view.depth.size / LARGEST))
+    label = labelled(view if stride == 1 else show(i, stride), planes, config)
+    if stride > 1:
+        rows, columns = (np.minimum(np.arange(n) // stride, n // stride - 1) for n in view.depth.shape)
+        label = label[rows[:, None], columns]
+    label = np.where(view.known, label, 0)
+    depth, own = agreement.prediction.depth[i].clone(), agreement.prediction.depth[i]
+    for k, plane in enumerate(planes):
+        there = plane.depth(view)
+        on = (label == k + 1) & (there > 0)
+        label[(label == k + 1) & ~on] = 0
+        depth = torch.from_numpy(there).to(depth).where(torch.from_numpy(on), depth)
+    on = torch.from_numpy(label > 0)
+    move = (depth / own).log().where(on, torch.zeros_like(depth))
+    return depth, torch.hypot(agreement.error[i], move), torch.from_numpy(label)

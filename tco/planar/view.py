@@ -68,10 +68,10 @@ def shown(prediction: Prediction, cameras: Cameras, views: Views, i: int, stride
     depth, confidence = prediction.depth[i].float(), prediction.confidence[i].float()
     known = views.valid[i] & torch.isfinite(depth) & (depth > 0)
     depth = depth.where(known, torch.ones_like(depth))
-    sure = (confidence - 1).clamp_min(0) * known
+    sure = (confidence - 1).where(known & ~confidence.isnan(), torch.zeros_like(depth)).clamp(0, 1e6)
     ray = rays(pixel_grid(*views.size, depth).reshape(-1, 2), cameras.K[i].float()).reshape(*views.size, 3)
     pose = cameras.world_from_cam[i].float()
-    image = views.images[i, :, :h, :w].float().permute(1, 2, 0)
+    image = views.images[i, :, :h, :w].float().nan_to_num().permute(1, 2, 0)
     image = image.reshape(h // stride, stride, w // stride, stride, 3).mean((1, 3))
     return Shown(
         depth[pick].numpy(), sure[pick].numpy(), known[pick].numpy(), image.numpy(),
@@ -109,6 +109,9 @@ class Plane:
         axes: (2, 3) directions in the plane.
         covariance: (3, 3) of (a, b, c), where the plane's error at centre + u axes[0] + v axes[1] is
             a u + b v + c along n; zeros before the first fit to labels.
+
+    A point on a ray of direction r is (n·X − d) / (n·r) deeper than the plane, so that errors of depth are
+    |n·r| times as large along n.
     """
 
     normal: Floats
@@ -128,6 +131,6 @@ class Plane:
         """Relative standard error (H, W) of these depths of the plane, by its covariance."""
         points = view.centre + view.directions * depth[..., None] - self.centre
         at = np.concatenate([points @ self.axes.T, np.ones((*depth.shape, 1))], -1)
-        variance = np.einsum("hwi,ij,hwj->hw", at, self.covariance, at)
+        variance = ((at @ self.covariance) * at).sum(-1)
         along = np.abs(view.directions @ self.normal).clip(1e-6)
         return np.sqrt(variance.clip(0)) / along / depth.clip(1e-6)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from tco.consensus import Agreement, agreed
 from tco.options import ConsensusConfig
+from tco.planar import run
 from tco.planar._kernels import least_labels
 from tco.planar.fit import ALIKE, LEAST, find, refit
 from tco.planar.label import ACROSS, BINS, MOST_UNLIKE, borders, labelled, rarity
@@ -133,7 +134,7 @@ def test_the_wall_is_found_among_outliers(scene: Wall) -> None:
     depth[:, :, 90:] *= 1.5
     confidence = torch.full_like(depth, 6.0)
     confidence[:, :, 90:] = 1.5
-    planes = find(seen(scene, depth, confidence), CONFIG, np.random.default_rng(0))
+    planes = find(seen(scene, depth, confidence), 6, CONFIG, np.random.default_rng(0))
     best = planes[0]
     side = math.copysign(1, best.normal @ NORMAL)
     assert abs(best.normal @ NORMAL) > math.cos(math.radians(1.0))
@@ -144,36 +145,36 @@ def test_no_more_planes_than_asked_and_none_that_explain_little(scene: Wall) -> 
     depth = scene.depth.clone()
     depth[:, :, 64:] *= 1.3
     views = seen(scene, depth)
-    assert len(find(views, CONFIG, np.random.default_rng(0))) >= 2
-    one = find(views, replace(CONFIG, planes=1), np.random.default_rng(0))
+    assert len(find(views, 6, CONFIG, np.random.default_rng(0))) >= 2
+    one = find(views, 6, replace(CONFIG, planes=1), np.random.default_rng(0))
     assert len(one) == 1
-    assert len(find(views, replace(CONFIG, plane_share=0.6), np.random.default_rng(0))) == 0
+    assert len(find(views, 6, replace(CONFIG, plane_share=0.6), np.random.default_rng(0))) == 0
 
 
-def fitted(scene: Wall, depth: Tensor, confidence: float, shown_views: int = 6) -> Plane:
+def fitted(scene: Wall, depth: Tensor, confidence: float) -> Plane:
     views = seen(scene, depth, confidence)
-    start = find(views, replace(CONFIG, planes=1), np.random.default_rng(0))
+    start = find(views, 6, replace(CONFIG, planes=1), np.random.default_rng(0))
     labels = [np.ones(view.depth.shape, np.int64) for view in views]
-    return refit(views, labels, start, CONFIG, shown_views)[0]
+    return refit(views, labels, start, CONFIG)[0]
 
 
 def test_covariance_is_that_of_so_many_independent_errors(scene: Wall) -> None:
-    """At the centre the variance is σ² d² / n with n = V / ALIKE; it falls with views that are not shown."""
+    """At the centre the variance is that of σ d |n·r| over n = V / ALIKE errors, and goes with σ²."""
     plane = fitted(scene, scene.depth, 2.0)
     at_centre = math.sqrt(plane.covariance[2, 2])
-    inverse = np.mean([1 / view.depth**2 for view in seen(scene, scene.depth)])
+    views = seen(scene, scene.depth)
+    across = np.stack([view.depth * np.abs(view.directions @ NORMAL) for view in views])
+    inverse = np.mean(1 / across**2)
     assert at_centre == pytest.approx(ERROR / math.sqrt(inverse * 6 / ALIKE), rel=0.1)
-    twice = fitted(scene, scene.depth, 2.0, 12)
-    assert np.allclose(twice.covariance, plane.covariance / 2)
     surer = fitted(scene, scene.depth, 1 + ERROR / LEAST)
     assert np.allclose(surer.covariance, plane.covariance * (LEAST / ERROR) ** 2, rtol=1e-3)
 
 
 def test_refit_forgets_planes_that_few_took(scene: Wall) -> None:
     views = seen(scene, scene.depth)
-    planes = find(views, CONFIG, np.random.default_rng(0))
+    planes = find(views, 6, CONFIG, np.random.default_rng(0))
     labels = [np.zeros(view.depth.shape, np.int64) for view in views]
-    assert refit(views, labels, planes, CONFIG, 6) == []
+    assert refit(views, labels, planes, CONFIG) == []
 
 
 def patch(scene: Wall) -> Tensor:
@@ -331,10 +332,91 @@ def test_consensus_comes_first_and_uncertain_cameras_keep_their_depths(scene: Wa
     some = together(prediction, cameras(scene), scene.views, scene.priors, CONFIG)
     expected = flattened(asked, cameras(scene), scene.views, CONFIG)
     assert torch.equal(some.agreement.prediction.depth, expected.agreement.prediction.depth)
-    assert torch.equal(some.agreement.error, asked.error)
+    move = (some.agreement.prediction.depth / asked.prediction.depth).log()
+    assert torch.allclose(some.agreement.error, torch.hypot(asked.error, move), rtol=1e-4)
+    assert torch.equal(some.before.prediction.depth, asked.prediction.depth)
+    assert torch.equal(some.before.error, asked.error)
+    alone = together(
+        prediction, cameras(scene), scene.views, scene.priors, replace(CONFIG, consensus_rounds=0)
+    )
+    assert torch.equal(alone.agreement.prediction.depth, depth)
     assert (some.labels > 0).float().mean() > 0.5
     assert scene.priors.rotation_sigma is not None
     unsure = replace(scene.priors, rotation_sigma=100 * scene.priors.rotation_sigma)
     kept = together(prediction, cameras(scene), scene.views, unsure, CONFIG)
     assert torch.equal(kept.agreement.prediction.depth, depth)
     assert not kept.labels.any()
+
+
+def test_planes_that_few_views_see_are_kept() -> None:
+    """Twelve views of one wall and one of another: each is flattened, whichever views those are."""
+    front, back = wall(12, (48, 64), SLOPE), wall(13, (48, 64), -0.5)
+    depth = torch.cat([noisy_of(front.depth), noisy_of(back.depth[12:])])
+    truth = torch.cat([front.depth, back.depth[12:]])
+    there = Cameras(
+        torch.cat([cameras(front).world_from_cam, cameras(back).world_from_cam[12:]]),
+        cameras(back).K,
+    )
+    images = torch.cat([front.views.images, back.views.images[12:]])
+    views = Views(images, torch.ones_like(depth, dtype=torch.bool), tuple(map(str, range(13))))
+    for shift in range(3):
+        order = torch.arange(13).roll(shift)
+        given = Prediction(depth[order], torch.full_like(depth, 4.0), there[order], tuple(range(13)))
+        turned = Views(images[order], views.valid, views.names)
+        flat = flattened(Agreement(given, torch.full_like(depth, 0.01)), there[order], turned, CONFIG)
+        at = int((order == 12).nonzero())
+        assert (flat.labels[at] > 0).float().mean() > 0.5
+        off = (flat.agreement.prediction.depth[at] / truth[12] - 1).abs()
+        assert off.median() < 0.5 * (depth[12] / truth[12] - 1).abs().median()
+
+
+def noisy_of(depth: Tensor) -> Tensor:
+    """With errors of 0.3 %."""
+    coarse = torch.randn(len(depth), 1, 24, 32, generator=torch.Generator().manual_seed(5))
+    waves = torch.nn.functional.interpolate(coarse, depth.shape[1:], mode="bilinear")[:, 0]
+    return depth * (1 + 0.003 * waves / waves.std())
+
+
+def test_what_is_no_number_harms_its_own_pixels_alone(scene: Wall) -> None:
+    depth, confidence = noisy(scene, 0.01), torch.full_like(scene.depth, 1.5)
+    depth[0, 5, 5], confidence[0, 5, 5] = 0, math.inf
+    confidence[1, 40:44, 40:44] = math.nan
+    images = scene.views.images.clone()
+    images[2, :, 8, 8] = math.nan
+    views = replace(scene.views, images=images)
+    flat = flattened(agreement(scene, depth, confidence), cameras(scene), views, CONFIG)
+    assert ((flat.labels > 0).float().mean((1, 2)) > 0.8).all()
+    assert torch.isfinite(flat.agreement.prediction.depth).all()
+
+
+def test_colours_that_nothing_sure_shows_are_not_rare() -> None:
+    colours = np.array([[0, BINS**3 - 1]])
+    sure = np.array([[1.0, 0.0]])
+    assert (rarity(colours, sure, np.ones((1, 2)))[colours] == 0).all()
+    assert (rarity(colours, np.zeros((1, 2)), np.ones((1, 2))) == 0).all()
+
+
+def test_a_plane_behind_the_camera_is_never_taken() -> None:
+    """A floor and its horizon: above it, keeping the depth is all there is, however smooth it shall be."""
+    floor = wall(3, (48, 64), 0.0)
+    normal = np.array([0.0, 1.0, 0.0])
+    prediction = Prediction(floor.depth, torch.full_like(floor.depth, 1.02), cameras(floor), (0, 1, 2))
+    views = [shown(prediction, cameras(floor), floor.views, i) for i in range(3)]
+    plane = Plane(normal, 1.0, np.array([0.0, 1, 2]), np.eye(3)[[0, 2]], np.zeros((3, 3)))
+    for view in views:
+        label = labelled(view, [plane], replace(CONFIG, plane_smoothness=20.0))
+        assert not label[plane.depth(view) == 0].any()
+
+
+def test_labels_of_large_pictures_are_coarser_and_their_depths_are_not(
+    scene: Wall, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run, "LARGEST", 4000)
+    depth = noisy(scene, 0.01)
+    flat = flattened(agreement(scene, depth, 1.5), cameras(scene), scene.views, CONFIG)
+    label = flat.labels[0]
+    assert torch.equal(label[::2, ::2], label[1::2, 1::2])
+    on = flat.labels > 0
+    assert on.float().mean() > 0.8
+    off = (flat.agreement.prediction.depth / scene.depth - 1).abs()[on]
+    assert off.max() < 0.01
