@@ -155,7 +155,7 @@ def _asked(own: Tensor, together: Agreement, i: int, valid: Tensor) -> dict[str,
     moved = (after[known] / own[known]).log().abs()
     return {
         "moved_by_consensus": _median(moved),
-        "asked_by_consensus": float(torch.isfinite(spread)[valid].float().mean()),
+        "asked_by_consensus": float(spread.isfinite()[valid].float().mean()),
     }
 
 

@@ -449,13 +449,14 @@ def test_maps_are_nearer_to_the_truth_after_the_views_were_asked(done: Done) -> 
         known = truth(room, i, own.shape)
         errors.append([np.median(np.abs(depth / known - 1)) for depth in (own, together)])
         told = done.result.report["views"][name]["moved_by_consensus"]
-        assert told == pytest.approx(float(np.median(np.abs(np.log(together / own)))), rel=0.01)
+        on_planes = done.result.report["views"][name]["on_planes"]
         assert told > 0
+        assert 0 <= on_planes <= 1
+        if on_planes == 0:
+            assert told == pytest.approx(float(np.median(np.abs(np.log(together / own)))), rel=0.01)
         asked = done.result.report["views"][name]["asked_by_consensus"]
         error = read_map(paths.error_map(name))
-        assert (
-            error.shape == own.shape and bool(((error == 0) | (error >= 1e-6)).all()) and error.max() < 0.15
-        )
+        assert error.shape == own.shape and bool(((error == 0) | (error >= 1e-6)).all()) and error.max() < 0.5
         known_error = error > 0
         agreed = read_view(paths, name, agreed=True)
         assert agreed.depth.tobytes() == together.tobytes() and agreed.error is not None
