@@ -39,8 +39,8 @@ class OnPlanes:
     """Depths of which some are those of planes.
 
     Attributes:
-        agreement: with these depths, on the CPU. Where a depth was moved by a factor e^m, its standard
-            error s has become √(s² + m²): it is still how far the views are from what is said now.
+        agreement: with these depths, on the CPU. Where a depth is a plane's, its standard error is the
+            plane's if that is larger than what it was by how far apart the views were.
         before: the agreement without planes.
         planes: that were found.
         labels: (V, H, W) 0 where a pixel kept its depth, else the number of its plane, from 1.
@@ -124,12 +124,11 @@ def _view_on_planes(
         rows, columns = (np.minimum(np.arange(n) // stride, n // stride - 1) for n in view.depth.shape)
         label = label[rows[:, None], columns]
     label = np.where(view.known, label, 0)
-    depth, own = agreement.prediction.depth[i].clone(), agreement.prediction.depth[i]
+    depth, error = agreement.prediction.depth[i].clone(), agreement.error[i].clone()
     for k, plane in enumerate(planes):
         there = plane.depth(view)
         on = (label == k + 1) & (there > 0)
         label[(label == k + 1) & ~on] = 0
-        depth = torch.from_numpy(there).to(depth).where(torch.from_numpy(on), depth)
-    on = torch.from_numpy(label > 0)
-    move = (depth / own).log().where(on, torch.zeros_like(depth))
-    return depth, torch.hypot(agreement.error[i], move), torch.from_numpy(label)
+        depth[on] = torch.from_numpy(there[on]).to(depth)
+        error[on] = torch.maximum(error[on], torch.from_numpy(plane.error(view, there)[on]).to(error))
+    return depth, error, torch.from_numpy(label)
