@@ -25,9 +25,9 @@ from colmap_tco.tracks import covisibility, read_tracks
 from colmap_tco.views import ViewConfig, batch, make_views
 from colmap_tco.workspace import open_workspace
 from tco.backbones.weights import load_sweep
-from tco.consensus import agreed
 from tco.optimize import errors_at_points, optimize
 from tco.options import ConsensusConfig, TCOConfig
+from tco.planar.run import together
 
 
 def reconstruct(root: Path, size: int, config: TCOConfig) -> tuple[Cloud, dict[str, ViewMaps], torch.Tensor]:
@@ -51,14 +51,15 @@ def reconstruct(root: Path, size: int, config: TCOConfig) -> tuple[Cloud, dict[s
     # Test-time optimisation. The network is as before when this returns; steps=0 would leave it alone.
     outcome = optimize(network, views, priors.optimise, config)
 
-    # Consensus: each pixel's depth by what all views that see the place say of it.
-    together = agreed(outcome.prediction, outcome.cameras, views, priors.optimise, ConsensusConfig())
-    errors = torch.cat(errors_at_points(together.prediction, priors.held_out))
+    # Consensus: each pixel's depth by what all views that see the place say of it; then planes among these.
+    flat = together(outcome.prediction, outcome.cameras, views, priors.optimise, ConsensusConfig())
+    agreement = flat.agreement
+    errors = torch.cat(errors_at_points(agreement.prediction, priors.held_out))
 
     # Back to COLMAP's units, with a normal for each depth.
     own, maps = (
         [view_maps(v, prediction, i, views.valid, frame.scale, error) for i, v in enumerate(images)]
-        for prediction, error in ((outcome.prediction, None), (together.prediction, together.error))
+        for prediction, error in ((outcome.prediction, None), (agreement.prediction, agreement.error))
     )
 
     # Fusion: what several views found each by itself, gaps filled with what they agreed on; coloured from the
