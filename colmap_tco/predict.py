@@ -114,8 +114,11 @@ def predict_chunk(
     )
     assert priors.optimise.sparse is not None
     flat = together(outcome.prediction, outcome.cameras, there, priors.optimise, consensus, seed)
-    prediction, error = flat.agreement.prediction, flat.agreement.error
-    own, moved = outcome.prediction.to("cpu"), outcome.cameras.to("cpu")
+    prediction, own, moved = (
+        flat.agreement.prediction,
+        outcome.prediction.to("cpu"),
+        outcome.cameras.to("cpu"),
+    )
     used = errors_at_points(prediction, priors.optimise.sparse)
     held = errors_at_points(prediction, priors.held_out)
     results = {}
@@ -134,7 +137,7 @@ def predict_chunk(
             "correction": _correction(outcome, i, frame.scale),
             "on_planes": float((flat.labels[i] > 0)[images.valid[i]].float().mean()),
         }
-        corrected = corrected_view(view, frame.scale, cameras, moved, i)
+        corrected = corrected_view(view, frame.scale, cameras, outcome.cameras.to("cpu"), i)
         maps = view_maps(view, prediction, i, images.valid, frame.scale, error, num_threads)
         before = view_maps(view, own, i, images.valid, frame.scale, num_threads=num_threads)
         figures |= _asked(own.depth[i], flat.before, i, images.valid[i])
