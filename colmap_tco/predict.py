@@ -114,11 +114,7 @@ def predict_chunk(
     )
     assert priors.optimise.sparse is not None
     flat = together(outcome.prediction, outcome.cameras, there, priors.optimise, consensus, seed)
-    prediction, own, moved = (
-        flat.agreement.prediction,
-        outcome.prediction.to("cpu"),
-        outcome.cameras.to("cpu"),
-    )
+    prediction, error, own = flat.agreement.prediction, flat.agreement.error, outcome.prediction.to("cpu")
     used = errors_at_points(prediction, priors.optimise.sparse)
     held = errors_at_points(prediction, priors.held_out)
     results = {}
