@@ -60,6 +60,8 @@ TABLES = (
           ("--baselines", "--steps", "5", "--max_image_size", "384"), "384 pixels"),
     Table("quality-steps", "quality", "quality.md",
           ("--baselines", "--steps", "10", "20", "40"), "more steps"),
+    Table("quality-seed", "quality", "quality.md",
+          ("--baselines", "--steps", "5", "--seed", "1"), "another seed"),
     Table("claim", "claim", "claim.md", _THREE),
     Table("claim-hills", "claim", "claim.md", (*_TWO, "--sets", "hills", "knots"), "hills and knots"),
     Table("claim-walk", "claim", "claim.md", (*_TWO, "--sets", "walk", "temple"), "walk and temple"),
