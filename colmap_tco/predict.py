@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from tco.backbones.base import Backbone
-    from tco.consensus import Agreement
     from tco.optimize import Outcome
+    from tco.planar.run import OnPlanes
     from tco.types import Cameras, Prediction
 
 log = logging.getLogger(__name__)
@@ -114,7 +114,8 @@ def predict_chunk(
     )
     assert priors.optimise.sparse is not None
     flat = together(outcome.prediction, outcome.cameras, there, priors.optimise, consensus, seed)
-    prediction, error, own = flat.agreement.prediction, flat.agreement.error, outcome.prediction.to("cpu")
+    prediction, error = flat.agreement.prediction, flat.agreement.error
+    own, moved = outcome.prediction.to("cpu"), outcome.cameras.to("cpu")
     used = errors_at_points(prediction, priors.optimise.sparse)
     held = errors_at_points(prediction, priors.held_out)
     results = {}
@@ -131,12 +132,11 @@ def predict_chunk(
             "error_of_one_depth": _error_of_one_depth(priors.optimise.sparse[i].depth),
             "reprojection_error_pixels": check.per_view.get(view.name),
             "correction": _correction(outcome, i, frame.scale),
-            "on_planes": float((flat.labels[i] > 0)[images.valid[i]].float().mean()),
         }
-        corrected = corrected_view(view, frame.scale, cameras, outcome.cameras.to("cpu"), i)
         maps = view_maps(view, prediction, i, images.valid, frame.scale, error, num_threads)
         before = view_maps(view, own, i, images.valid, frame.scale, num_threads=num_threads)
-        figures |= _asked(own.depth[i], flat.before, i, images.valid[i])
+        figures |= _asked(own.depth[i], flat, i, images.valid[i])
+        corrected = corrected_view(view, frame.scale, cameras, moved, i)
         results[view.name] = ViewResult(maps, before, figures, corrected)
     if aligned is not None:
         steps = [
@@ -147,14 +147,15 @@ def predict_chunk(
     return ChunkResult(results, outcome.history, {})
 
 
-def _asked(own: Tensor, together: Agreement, i: int, valid: Tensor) -> dict[str, object]:
-    """By how much, relative, others moved the depths of view ``i``, and of what share enough spoke."""
-    after, spread = together.prediction.depth[i], together.error[i]
+def _asked(own: Tensor, flat: OnPlanes, i: int, valid: Tensor) -> dict[str, object]:
+    """By how much, relative, others moved the depths of view ``i``, of what share enough spoke, and planes'."""
+    after, spread = flat.before.prediction.depth[i], flat.before.error[i]
     known = valid & (own > 0) & (after > 0)
     moved = (after[known] / own[known]).log().abs()
     return {
         "moved_by_consensus": _median(moved),
         "asked_by_consensus": float(spread.isfinite()[valid].float().mean()),
+        "on_planes": float((flat.labels[i] > 0)[valid].float().mean()),
     }
 
 

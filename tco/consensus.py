@@ -86,6 +86,9 @@ def agreed(
             deviations of the cameras say whether asking is of any use.
         config: settings.
 
+    Returns:
+        With ``prediction`` itself where nobody is asked: of no round, a single view, or uncertain cameras.
+
     Raises:
         ValueError: the prediction is of some of the views alone, or there is no overlap among the priors.
     """
@@ -96,7 +99,7 @@ def agreed(
     error = torch.full_like(prediction.depth, math.inf)
     if config.consensus_rounds == 0 or len(views) < 2:
         return Agreement(prediction, error)
-    consequence = "views are not asked for each other's depths (--consensus_uncertainty)"
+    consequence = "views are not asked for each other's depths, nor put on planes (--consensus_uncertainty)"
     if priors.cameras is not None and too_uncertain(
         priors, views.size, config.consensus_uncertainty, consequence
     ):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -100,7 +100,7 @@ def find(
         normal, offset, on = _robust(pixels, *best)
         if on.sum() < FEWEST or pixels.weight[on].sum() < config.plane_share * total:
             break
-        found.append(_plane(pixels[on], normal, offset, np.zeros((3, 3))))
+        found.append(_plane(pixels[on], normal, offset))
         pixels = pixels[~pixels.near(normal, offset, 1.5)]
     return found
 
@@ -150,13 +150,13 @@ def _least_squares(points: Floats, weight: Floats, like: Floats) -> tuple[Floats
     return normal.astype(np.float32), float(normal @ mean)
 
 
-def _plane(pixels: _Pixels, normal: Floats, offset: float, covariance: Floats) -> Plane:
-    """With a centre in the middle of pixels and two axes."""
+def _plane(pixels: _Pixels, normal: Floats, offset: float) -> Plane:
+    """With a centre in the middle of pixels and two axes, and no covariance yet."""
     axis = np.eye(3, dtype=np.float32)[int(np.abs(normal).argmin())]
     u = np.cross(normal, axis)
     u /= np.linalg.norm(u)
     centre = pixels.weight @ pixels.points / max(float(pixels.weight.sum()), 1e-12)
-    return Plane(normal, offset, centre, np.stack([u, np.cross(normal, u)]), covariance)
+    return Plane(normal, offset, centre, np.stack([u, np.cross(normal, u)]), np.zeros((3, 3)))
 
 
 def refit(
@@ -185,7 +185,7 @@ def refit(
             off = (pixels.points @ normal - offset) / across / bounded(pixels.error)
             weight = pixels.weight / across**2 / (1 + off**2) ** 2
             normal, offset = _least_squares(pixels.points, weight, normal)
-        fitted = _plane(pixels, normal, offset, np.zeros((3, 3)))
+        fitted = _plane(pixels, normal, offset)
         found.append(_with_covariance(fitted, pixels, 1 / (ALIKE * labels[0].size)))
     return found
 
@@ -206,5 +206,4 @@ def _with_covariance(plane: Plane, pixels: _Pixels, stands_for: float) -> Plane:
     information = stands_for / (near.error.clip(LEAST) * near.across(plane.normal)).astype(np.float64) ** 2
     normal_equations = at.T @ (information[:, None] * at)
     normal_equations += 1e-9 * information.sum() * np.eye(3)
-    covariance = np.linalg.inv(normal_equations)
-    return Plane(plane.normal, plane.offset, plane.centre, plane.axes, covariance)
+    return replace(plane, covariance=np.linalg.inv(normal_equations))

@@ -17,7 +17,6 @@ from tco.options import ConsensusConfig
 from tco.planar.fit import find, refit
 from tco.planar.label import labelled
 from tco.planar.view import Plane, Shown, shown
-from tco.polish import too_uncertain
 from tco.types import Cameras, Prediction, Priors, Views
 
 ROUNDS = 3
@@ -58,6 +57,8 @@ def together(
 ) -> OnPlanes:  # fmt: skip
     """What the views agree on and, where that is flat, the plane: consensus, then planes.
 
+    Where nobody is asked, for instance because the cameras are uncertain, there are no planes either.
+
     Args:
         prediction: of all V views, each by itself.
         cameras: of all V views.
@@ -69,14 +70,10 @@ def together(
     Raises:
         ValueError: as :func:`tco.consensus.agreed`.
     """
-    agreement = agreed(prediction, cameras, views, priors, config).to("cpu")
-    consequence = "depths are not moved onto planes (--consensus_uncertainty)"
-    if config.consensus_rounds == 0 or (
-        priors.cameras is not None
-        and too_uncertain(priors, views.size, config.consensus_uncertainty, consequence)
-    ):
+    agreement = agreed(prediction, cameras, views, priors, config)
+    if agreement.prediction is prediction:
         config = replace(config, planes=0)
-    return flattened(agreement, cameras.to("cpu"), views.to("cpu"), config, seed)
+    return flattened(agreement.to("cpu"), cameras.to("cpu"), views.to("cpu"), config, seed)
 
 
 @torch.no_grad()
