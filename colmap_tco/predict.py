@@ -148,7 +148,7 @@ def predict_chunk(
 
 
 def _asked(own: Tensor, flat: OnPlanes, i: int, valid: Tensor) -> dict[str, object]:
-    """By how much, relative, others moved the depths of view ``i``, of what share enough spoke, and planes'."""
+    """By how much others moved the depths of view ``i``, of what share enough spoke, what is on planes."""
     after, spread = flat.before.prediction.depth[i], flat.before.error[i]
     known = valid & (own > 0) & (after > 0)
     moved = (after[known] / own[known]).log().abs()
