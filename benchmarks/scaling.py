@@ -20,8 +20,9 @@ from benchmarks.real import RealSet, arguments, load, median_error, within
 from benchmarks.tables import cell, paragraph, plot_beside, publish, runs, weights_told
 from tco.backbones.base import Backbone
 from tco.backbones.weights import EMBEDDED, load_sweep
-from tco.optimize import errors_at_points, optimize
+from tco.optimize import optimize
 from tco.options import TCOConfig
+from tco.terms import errors_at_points
 
 Run = tuple[float, float, float, float, float]
 """Seconds; within 2 and 5 % of the truth; median error; hidden points within 5 %."""

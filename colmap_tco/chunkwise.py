@@ -25,7 +25,7 @@ from colmap_tco.progress import Progress
 from colmap_tco.resume import Result
 from colmap_tco.tracks import Covisibility, Tracks
 from colmap_tco.views import View
-from tco.options import ConsensusConfig, TCOConfig
+from tco.options import TCOConfig
 
 if TYPE_CHECKING:
     from tco.backbones.base import Backbone
@@ -55,7 +55,7 @@ class Means(NamedTuple):
 
 def predict_chunks(
     result: Result, scene: Scene, plan: ChunkPlan, means: Means,
-    settings: tuple[PriorConfig, TCOConfig, ConsensusConfig, int], progress: Progress,
+    settings: tuple[PriorConfig, TCOConfig, int], progress: Progress,
 ) -> dict[str, str]:  # fmt: skip
     """Optimise the chunks that are not finished yet and write the maps of their views.
 

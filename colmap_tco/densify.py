@@ -37,7 +37,7 @@ from colmap_tco.tracks import Covisibility, Tracks, covisibility, read_tracks
 from colmap_tco.views import View, ViewConfig, make_views
 from colmap_tco.workspace import Workspace, WorkspaceConfig, existing_root, find_models, open_workspace
 from tco.config import check_range, knob
-from tco.options import ConsensusConfig, TCOConfig
+from tco.options import TCOConfig
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +59,6 @@ class DensifyConfig:
     )
     network: NetworkConfig = field(default_factory=NetworkConfig)
     tco: TCOConfig = field(default_factory=TCOConfig)
-    consensus: ConsensusConfig = field(default_factory=ConsensusConfig)
     views: ViewConfig = field(default_factory=ViewConfig)
     priors: PriorConfig = field(default_factory=PriorConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
@@ -182,7 +181,7 @@ def _densify(root: Path, config: DensifyConfig, bare: bool, progress: Progress) 
     skipped = {**workspace.skipped, **skipped, **blind, **alone}
     with clock("optimisation"):
         means = Means(chosen, budget, existing, config.num_threads)
-        settings = (config.priors, config.tco, config.consensus, config.seed)
+        settings = (config.priors, config.tco, config.seed)
         failed = predict_chunks(result, Scene(tracks, views, pairs), plan, means, settings, progress)
     used = _used(result, views, config.refine_cameras)
     if not used:

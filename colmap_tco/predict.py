@@ -15,7 +15,7 @@ from colmap_tco.outputs import ViewMaps
 from colmap_tco.priors import PriorConfig, build_priors, check_projection, chunk_frame
 from colmap_tco.tracks import Tracks
 from colmap_tco.views import Picture, View, batch, crop, network_image
-from tco.options import ConsensusConfig, TCOConfig
+from tco.options import TCOConfig
 
 if TYPE_CHECKING:
     import torch
@@ -70,7 +70,7 @@ def predict_chunk(
     tracks: Tracks,
     views: Sequence[View],
     chunk: Chunk,
-    settings: tuple[PriorConfig, TCOConfig, ConsensusConfig, int],
+    settings: tuple[PriorConfig, TCOConfig, int],
     report: Callable[[dict[str, float]], None],
     picture: Callable[[View], Picture] = network_image,
     num_threads: int = -1,
@@ -82,7 +82,7 @@ def predict_chunk(
         tracks: of the model.
         views: all views of the workspace; the chunk's indices refer to them.
         chunk: owned and context views.
-        settings: of priors, optimisation and consensus, and the seed.
+        settings: of priors and of optimisation, and the seed.
         report: called with the terms of each step.
         picture: makes the picture of a view for the network.
         num_threads: for the normals, one a core if not positive.
@@ -91,10 +91,11 @@ def predict_chunk(
         InputError: the points do not project where the keypoints are, or an image cannot be read.
     """
     from tco.align import CameraPenalties, KnownCameras
-    from tco.optimize import errors_at_points, optimize
-    from tco.planar.run import together
+    from tco.conclusion import concluded
+    from tco.optimize import optimize
+    from tco.terms import errors_at_points
 
-    (backbone, device), (prior_config, tco_config, consensus, seed) = network, settings
+    (backbone, device), (prior_config, tco_config, seed) = network, settings
     penalties = CameraPenalties.of(tco_config)
     aligned = None if backbone.uses_cameras else KnownCameras(backbone, penalties)
     members = [views[i] for i in chunk.views]
@@ -113,9 +114,9 @@ def predict_chunk(
         watched=[points.to(device) for points in priors.held_out],
     )
     assert priors.optimise.sparse is not None
-    flat = together(outcome.prediction, outcome.cameras, there, priors.optimise, consensus, seed)
+    own, flat = concluded(outcome, there, priors.optimise, tco_config, seed)
     prediction, error = flat.agreement.prediction, flat.agreement.error
-    own, moved = outcome.prediction.to("cpu"), outcome.cameras.to("cpu")
+    own, moved = own.to("cpu"), outcome.cameras.to("cpu")
     used = errors_at_points(prediction, priors.optimise.sparse)
     held = errors_at_points(prediction, priors.held_out)
     results = {}

@@ -25,8 +25,9 @@ from torch import Tensor, nn
 from colmap_tco.scene import Scene, open_scene
 from colmap_tco.views import ViewConfig
 from tco.geometry import pixel_grid, sample
-from tco.optimize import Outcome, errors_at_points, optimize
+from tco.optimize import Outcome, optimize
 from tco.options import TCOConfig
+from tco.terms import errors_at_points
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
 
 

@@ -25,9 +25,10 @@ from colmap_tco.tracks import covisibility, read_tracks
 from colmap_tco.views import ViewConfig, batch, make_views
 from colmap_tco.workspace import open_workspace
 from tco.backbones.weights import load_sweep
-from tco.optimize import errors_at_points, optimize
-from tco.options import ConsensusConfig, TCOConfig
-from tco.planar.run import together
+from tco.conclusion import concluded
+from tco.optimize import optimize
+from tco.options import TCOConfig
+from tco.terms import errors_at_points
 
 
 def reconstruct(root: Path, size: int, config: TCOConfig) -> tuple[Cloud, dict[str, ViewMaps], torch.Tensor]:
@@ -52,14 +53,14 @@ def reconstruct(root: Path, size: int, config: TCOConfig) -> tuple[Cloud, dict[s
     outcome = optimize(network, views, priors.optimise, config)
 
     # Consensus: each pixel's depth by what all views that see the place say of it; then planes among these.
-    flat = together(outcome.prediction, outcome.cameras, views, priors.optimise, ConsensusConfig())
+    own_depths, flat = concluded(outcome, views, priors.optimise, config)
     agreement = flat.agreement
     errors = torch.cat(errors_at_points(agreement.prediction, priors.held_out))
 
     # Back to COLMAP's units, with a normal for each depth.
     own, maps = (
         [view_maps(v, prediction, i, views.valid, frame.scale, error) for i, v in enumerate(images)]
-        for prediction, error in ((outcome.prediction, None), (agreement.prediction, agreement.error))
+        for prediction, error in ((own_depths, None), (agreement.prediction, agreement.error))
     )
 
     # Fusion: what several views found each by itself, gaps filled with what they agreed on; coloured from the

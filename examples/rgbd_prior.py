@@ -24,8 +24,9 @@ from torch import Tensor
 from colmap_tco.scene import Scene, open_scene
 from colmap_tco.views import View, ViewConfig, canvas_size, crop, original_from_network
 from tco.backbones.weights import load_sweep
-from tco.optimize import Outcome, errors_at_points, optimize
+from tco.optimize import Outcome, optimize
 from tco.options import PolishConfig, TCOConfig
+from tco.terms import errors_at_points
 from tco.types import Priors
 
 

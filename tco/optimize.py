@@ -17,6 +17,7 @@ from tco.backbones.base import Backbone, RunsAhead
 from tco.context import detached, due, merged
 from tco.corrections import CameraCorrections
 from tco.free import FreePixels
+from tco.hints import joined, told, with_more
 from tco.lora import LoRAConfig, adapted, changed, fits
 from tco.options import TCOConfig
 from tco.penalties import sparse_depth
@@ -46,6 +47,8 @@ class Outcome:
         rolled_back: steps at which the loss or its gradient was not finite; ``config.steps`` among them
             stands for the prediction after the last.
         skipped: steps on the depths, counted from 0, of which the same is true.
+        before: the prediction with its depths as the network gave them, if they were refined since.
+        told: points that a view was told of beside those of the priors (:mod:`tco.hints`).
     """
 
     prediction: Prediction
@@ -54,6 +57,8 @@ class Outcome:
     history: list[dict[str, float]] = field(default_factory=list)
     rolled_back: tuple[int, ...] = ()
     skipped: tuple[int, ...] = ()
+    before: Prediction | None = None
+    told: Mapping[int, SparseDepth] = field(default_factory=dict)
 
 
 def optimize(
@@ -108,13 +113,12 @@ def optimize(
     """
     config = config or TCOConfig()
     with torch.no_grad():
-        encoded = backbone.encode(views, priors)
-        first = backbone.decode(encoded)
+        encoded, first, points = told(backbone, backbone.encode(views, priors), views, priors, config, seed)
     if config.steps == 0:
-        return Outcome(first, first.cameras)
+        return Outcome(first, first.cameras, told=points)
     terms, generator = Terms(views, priors, config, extra), torch.Generator().manual_seed(seed)
     run = _Run(backbone, views, priors, terms, encoded, first, generator)
-    run.watched = watched
+    run.watched, run.told = watched, points
     with run.adapters() as parameters:
         run.prepare(parameters)
         for step in range(config.steps):
@@ -151,6 +155,7 @@ class _Run:
         self.history: list[dict[str, float]] = []
         self.rolled_back: list[int] = []
         self.watched: Sequence[SparseDepth] = ()
+        self.told: Mapping[int, SparseDepth] = {}
         self.stopped = False
 
     def adapters(self) -> AbstractContextManager[list[torch.nn.Parameter]]:
@@ -310,6 +315,7 @@ class _Run:
         """Depths of the sources with a part of their points hidden; of all views if all are decoded."""
         encoded = self.encoded
         kept = {s: self.terms.sparse[s][shown] for s, shown in points.items() if not bool(shown.all())}
+        kept = {s: joined(p, self.told[s]) if s in self.told else p for s, p in kept.items()}
         if kept:
             encoded = self.backbone.with_points(encoded, kept)
         views = None if self.config.ablation.decode_all else list(points)
@@ -337,7 +343,8 @@ class _Run:
             return False
         self.encoded_cameras = self.corrections()
         priors = replace(self.priors, cameras=self.encoded_cameras)
-        self.encoded = self._ahead(self.backbone.encode(self.views, priors))
+        encoded = self.backbone.encode(self.views, priors)
+        self.encoded = self._ahead(with_more(self.backbone, encoded, self.terms.sparse, self.told))
         return True
 
     def _moved(self, corrections: CameraCorrections) -> bool:
@@ -360,7 +367,7 @@ class _Run:
         cameras = Cameras(cameras.world_from_cam.detach(), cameras.K.detach())
         prediction = detached(prediction)
         sizes = {} if self.corrections is None else self.corrections.sizes()
-        return Outcome(prediction, cameras, sizes, self.history, tuple(self.rolled_back))
+        return Outcome(prediction, cameras, sizes, self.history, tuple(self.rolled_back), told=self.told)
 
     def _last(self, anew: bool) -> Prediction:
         """All views by the network as it is now; helpers as they were, unless they were encoded ``anew``."""
@@ -383,6 +390,7 @@ class _Run:
         return replace(
             outcome,
             prediction=done.prediction,
+            before=outcome.prediction,
             history=[*outcome.history, *done.history],
             skipped=tuple(done.skipped),
         )
@@ -390,11 +398,3 @@ class _Run:
 
 FEWEST_POINTS = 4
 """A view keeps at least this many points as input when others are hidden."""
-
-
-def errors_at_points(prediction: Prediction, points: Sequence[SparseDepth]) -> list[Tensor]:
-    """Relative depth errors at points, one (N,) a view of the prediction, in the order of ``points``.
-
-    The depth at a point is that of the pixel it falls into: what a user reads off the map.
-    """
-    return [errors_at(depth, sparse) for depth, sparse in zip(prediction.depth, points, strict=True)]

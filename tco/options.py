@@ -74,7 +74,7 @@ class PolishConfig:
     """Refinement of each pixel's depth after the network was adapted (``tco/polish.py``)."""
 
     polish_looks: int = knob(
-        10,
+        6,
         "times that each view's depths are refined, after the steps on the network; 0, or no steps at all: "
         "never",
     )
@@ -93,6 +93,11 @@ class PolishConfig:
         "weight of the mean difference between the logarithms of the factors of neighbouring pixels, less "
         "across edges of the picture; raise it if surfaces get rough",
     )
+    polish_growth: float = knob(
+        2.0,
+        "a refined depth is taken back if the views' standard error around it has grown by more than this "
+        "factor; 0: none is",
+    )
     polish_levels: tuple[int, ...] = knob(
         (2, 8), "sides of the cells that share a factor, in pixels of the network's image; 1 follows noise"
     )
@@ -100,7 +105,7 @@ class PolishConfig:
     def __post_init__(self) -> None:
         if self.polish_looks < 0 or self.polish_sources < 1 or not self.polish_levels:
             raise ValueError("polish_looks must not be negative, and there must be a source and a level")
-        check_range(self, "polish_rate polish_uncertainty polish_smoothness", 0)
+        check_range(self, "polish_rate polish_uncertainty polish_smoothness polish_growth", 0)
         check_range(self, "polish_levels", 1)
 
     def steps(self, views: int) -> int:
@@ -166,6 +171,28 @@ class ConsensusConfig:
             raise ValueError("consensus_reach and consensus_width must be positive")
         if self.consensus_uncertainty < 0:
             raise ValueError("consensus_uncertainty must not be negative")
+
+
+@dataclass(frozen=True)
+class HintsConfig:
+    """What the views agree on, told to a network that takes points as input (``tco/hints.py``)."""
+
+    hint_rounds: int = knob(
+        1,
+        "times that a network that takes points is asked again, with further ones where the views agreed on "
+        "what it said before; 0: it is given COLMAP's points alone",
+    )
+    hint_points: int = knob(300, "further points of a view, at most")
+    hint_error: float = knob(0.01, "largest relative standard error of an agreed depth that becomes a point")
+    hint_confidence: float = knob(1.3, "least confidence of a depth that becomes a point")
+    hint_distance: float = knob(
+        0.04, "least distance of a further point from COLMAP's, as a share of the longer side of the picture"
+    )
+
+    def __post_init__(self) -> None:
+        check_range(self, "hint_rounds hint_confidence hint_distance", 0)
+        check_range(self, "hint_points", 1)
+        check_range(self, "hint_error", POSITIVE)
 
 
 @dataclass(frozen=True)
@@ -243,6 +270,8 @@ class TCOConfig:
     structure: float = knob(0.85, "share of the structural term (SSIM) in the comparison of colours")
     clip: float = knob(1.0, "largest norm of the gradient")
     polish: PolishConfig = field(default_factory=PolishConfig)
+    hints: HintsConfig = field(default_factory=HintsConfig)
+    consensus: ConsensusConfig = field(default_factory=ConsensusConfig)
     ablation: AblationConfig = field(default_factory=AblationConfig)
 
     def all_steps(self, views: int) -> int:

@@ -257,3 +257,11 @@ def means(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
 def _no_points(like: Tensor) -> SparseDepth:
     none = like.new_zeros(0)
     return SparseDepth(none.reshape(0, 2), none, none, none.long())
+
+
+def errors_at_points(prediction: Prediction, points: Sequence[SparseDepth]) -> list[Tensor]:
+    """Relative depth errors at points, one (N,) a view of the prediction, in the order of ``points``.
+
+    The depth at a point is that of the pixel it falls into: what a user reads off the map.
+    """
+    return [errors_at(depth, sparse) for depth, sparse in zip(prediction.depth, points, strict=True)]

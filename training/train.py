@@ -20,11 +20,15 @@ import torch.nn.functional as F
 from safetensors.torch import save_file
 from torch import Tensor
 
+from tco.backbones.decoder import SweepConfig
 from tco.backbones.sweep import Encoded, Stage, Sweep
 from tco.backbones.sweeping import BACKGROUND
 from tco.types import Priors, Views
 from training.dataset import load
 from training.loop import Loop, LoopConfig, arguments, launch
+
+CONTRAST = 10.0
+"""Factor by which the pictures' local contrast may be raised."""
 
 Drawn = tuple[tuple[Views, Priors, Tensor], np.random.Generator]
 
@@ -158,7 +162,7 @@ class Trainer(Loop):
 
     def network(self) -> Sweep:
         """The embedded network."""
-        return Sweep()
+        return Sweep(SweepConfig(equalise=CONTRAST))
 
     def export(self, path: Path) -> None:
         """Write the averaged weights with the sizes of the network."""

@@ -24,6 +24,8 @@ class SweepConfig:
         hypotheses: of each refinement pass.
         spacing: step of each refinement pass, in coarse planes.
         hidden: channels of the refinement.
+        equalise: factor that local equalisation may raise contrast by before all else
+            (:mod:`tco.backbones.contrast`); 0: none.
     """
 
     planes: int = 56
@@ -38,6 +40,7 @@ class SweepConfig:
     hypotheses: int = 8
     spacing: tuple[float, ...] = (0.3, 0.08)
     hidden: int = 48
+    equalise: float = 0.0
 
     def __post_init__(self) -> None:
         if self.planes % 8:

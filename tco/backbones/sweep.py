@@ -17,6 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from tco.backbones.contrast import equalised
 from tco.backbones.decoder import Decoder, SweepConfig, convex_upsample, soft_argmax
 from tco.backbones.layers import FeatureNet
 from tco.backbones.sweeping import BACKGROUND, Hints, interpolate_points, inverse_range, relative_cameras
@@ -136,8 +137,9 @@ class Sweep(nn.Module):
             raise ValueError("the sweep network needs cameras, sparse points and overlap as priors")
         if len(views) < 2:
             raise ValueError("a plane sweep needs at least two views")
-        with self.mixed(views.images.device):
-            coarse, fine, context = self.features(views.images, views.valid)
+        images = equalised(views.images, views.valid, self.config.equalise)
+        with self.mixed(images.device):
+            coarse, fine, context = self.features(images, views.valid)
         lo, hi = inverse_range(priors.sparse, views.images)
         step = (hi - lo) / (self.config.planes - 1)
         order = torch.argsort(priors.overlap, dim=1, descending=True, stable=True)

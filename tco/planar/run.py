@@ -71,6 +71,14 @@ def together(
         ValueError: as :func:`tco.consensus.agreed`.
     """
     agreement = agreed(prediction, cameras, views, priors, config)
+    return on_planes(agreement, prediction, cameras, views, config, seed)
+
+
+def on_planes(
+    agreement: Agreement, prediction: Prediction, cameras: Cameras, views: Views, config: ConsensusConfig,
+    seed: int = 0,
+) -> OnPlanes:  # fmt: skip
+    """The same of an agreement that is known already; on none if it is of the ``prediction`` itself."""
     if agreement.prediction is prediction:
         config = replace(config, planes=0)
     return flattened(agreement.to("cpu"), cameras.to("cpu"), views.to("cpu"), config, seed)

@@ -467,7 +467,8 @@ def test_maps_are_nearer_to_the_truth_after_the_views_were_asked(done: Done) -> 
 
 
 def test_views_that_are_not_asked_keep_their_own_maps(fresh_room: Room) -> None:
-    alone = replace(config(steps=0), consensus=ConsensusConfig(consensus_rounds=0))
+    plain = config(steps=0)
+    alone = replace(plain, tco=replace(plain.tco, consensus=ConsensusConfig(consensus_rounds=0)))
     paths = DensePaths(made(fresh_room.root, alone).folder)
     for name in fresh_room.names:
         for own, together in zip(

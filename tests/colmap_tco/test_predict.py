@@ -30,7 +30,7 @@ from colmap_tco.views import (
 )
 from colmap_tco.workspace import open_workspace
 from tco.geometry import so3_exp
-from tco.options import ConsensusConfig, TCOConfig
+from tco.options import TCOConfig
 from tco.types import Cameras
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def predicted(
     holdout: float = 0.2,
     picture: Callable[[View], Picture] = network_image,
 ) -> ChunkResult:
-    settings = (PriorConfig(holdout=holdout), TCOConfig(steps=steps), ConsensusConfig(), 0)
+    settings = (PriorConfig(holdout=holdout), TCOConfig(steps=steps), 0)
     return predict_chunk(
         (load(select(NetworkConfig(backbone="sweep", device="cpu"))), torch.device("cpu")),
         known.tracks, known.views, chunk, settings, lambda _: None, picture,

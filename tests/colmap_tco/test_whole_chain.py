@@ -29,7 +29,7 @@ from colmap_tco.priors import PriorConfig, chunk_frame
 from colmap_tco.tracks import read_tracks
 from colmap_tco.views import View, ViewConfig, canvas_size, make_views
 from colmap_tco.workspace import DensePaths, open_workspace
-from tco.options import ConsensusConfig, TCOConfig
+from tco.options import TCOConfig
 from tco.types import Prediction, Priors, SparseDepth, Views
 from tests.conftest import Shot, colmap_camera, look_at, write_text_model
 
@@ -111,7 +111,7 @@ def chain(root: Path, origin: Floats, shift: int = 0) -> tuple[Floats, list[View
     tracks = read_tracks(workspace.model)
     everything = Chunk(tuple(range(len(views))))
     reader = Reader(chunk_frame(tracks, views).scale, shift)
-    settings = (PriorConfig(holdout=0.0), TCOConfig(steps=0), ConsensusConfig(), 0)
+    settings = (PriorConfig(holdout=0.0), TCOConfig(steps=0), 0)
     done = predict_chunk((reader, torch.device("cpu")), tracks, views, everything, settings, lambda _: None)
     paths = DensePaths(root / "dense")
     for view in views:

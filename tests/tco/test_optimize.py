@@ -17,9 +17,10 @@ from tco.backbones.base import Backbone
 from tco.backbones.sweep import Sweep
 from tco.backbones.sweeping import Hints, interpolate_points
 from tco.backbones.weights import load_sweep
-from tco.optimize import Outcome, errors_at_points, optimize
+from tco.optimize import Outcome, optimize
 from tco.options import PolishConfig, TCOConfig
 from tco.penalties import sparse_depth
+from tco.terms import errors_at_points
 from tco.toy import Toy, wall
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
 

@@ -1,0 +1,77 @@
+"""What comes of an optimisation: refined depths where the views agree on them, the consensus, and planes.
+
+Refinement (:mod:`tco.polish`) brings depths nearer to the truth where the pictures have texture, and moves
+them at random where they have none: there colours say nothing and any step is as good. What it did is told by
+asking the views together (:mod:`tco.consensus`) with the depths of before and with those of after: where it
+did harm they lie further apart. So a pixel takes its depth of before if around it the views' standard error
+has grown by more than a factor.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from tco.consensus import Agreement, agreed
+from tco.options import TCOConfig
+from tco.planar.run import OnPlanes, on_planes
+from tco.planar.view import SIDE
+from tco.types import Prediction, Priors, Views
+
+if TYPE_CHECKING:
+    from tco.optimize import Outcome
+
+AROUND = 10
+"""Pixels to each side over which standard errors are averaged, in views of ``SIDE``² pixels."""
+LEAST, MOST = 1e-4, 0.5
+"""Bounds of a standard error there; where too few views spoke it is the larger one."""
+
+
+def concluded(
+    outcome: Outcome, views: Views, priors: Priors, config: TCOConfig, seed: int = 0
+) -> tuple[Prediction, OnPlanes]:
+    """Each view's own depths, refined or not, and what the views say together, on planes where it is flat.
+
+    Args:
+        outcome: of :func:`tco.optimize.optimize`.
+        views: that were optimised.
+        priors: that it was given.
+        config: its settings.
+        seed: of the planes that are drawn.
+
+    Raises:
+        ValueError: as :func:`tco.consensus.agreed`.
+    """
+    prediction, cameras = outcome.prediction, outcome.cameras
+    agreement = agreed(prediction, cameras, views, priors, config.consensus)
+    growth = config.polish.polish_growth
+    if outcome.before is not None and growth > 0 and agreement.prediction is not prediction:
+        before = agreed(outcome.before, cameras, views, priors, config.consensus)
+        keep = grown(before.error, agreement.error) <= growth
+        prediction = _where(keep, prediction, outcome.before)
+        depths = _where(keep, agreement.prediction, before.prediction)
+        agreement = Agreement(depths, agreement.error.where(keep, before.error))
+    return prediction, on_planes(agreement, prediction, cameras, views, config.consensus, seed)
+
+
+def grown(before: Tensor, after: Tensor) -> Tensor:
+    """Factor (V, H, W) by which standard errors (V, H, W) have grown around a pixel, in the mean of logs."""
+    side = math.sqrt(before.shape[-2] * before.shape[-1])
+    r = max(1, round(AROUND * side / SIDE))
+    change = (after.clamp(LEAST, MOST) / before.clamp(LEAST, MOST)).log().unsqueeze(1)
+    return F.avg_pool2d(change, 2 * r + 1, 1, r, count_include_pad=False).squeeze(1).exp()
+
+
+def _where(keep: Tensor, one: Prediction, other: Prediction) -> Prediction:
+    """The one with the other's depths and confidences where not ``keep``."""
+    return replace(
+        one,
+        depth=torch.where(keep, one.depth, other.depth),
+        confidence=torch.where(keep, one.confidence, other.confidence),
+        stages=(),
+    )

@@ -1,0 +1,140 @@
+"""What the views agree on, told to the network as further points.
+
+A network that takes triangulated points as input leans on them: it interpolates between those that are near,
+and where there are none, on plain walls and floors, it is on its own. Yet many pixels there are matched well,
+and by several views alike. So the network is asked twice. What it says first goes through the consensus of
+the views and onto their planes (:mod:`tco.planar`); of the pixels whose depths are then known well and that
+are far from any point, some are drawn and given to it with the points, and it is asked again. Matches are not
+looked for anew, so that this costs a decoding.
+
+They are input alone: no penalty holds depths to them, since they are the network's own word.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from tco.backbones.base import Backbone
+from tco.consensus import Agreement
+from tco.context import merged
+from tco.options import TCOConfig
+from tco.planar.run import together
+from tco.types import Prediction, Priors, SparseDepth, Views
+
+LEAST = 0.003
+"""Relative errors of agreed depths are at least this: their spread does not tell what all get wrong."""
+FEWEST_VIEWS = 8
+"""Views that it takes: how far apart a few are tells little of how wrong they are together."""
+UNTRACKED = -1
+"""Identity of points that are of one view alone."""
+
+
+@torch.no_grad()
+def told(
+    backbone: Backbone, encoded: Any, views: Views, priors: Priors, config: TCOConfig, seed: int = 0
+) -> tuple[Any, Prediction, dict[int, SparseDepth]]:
+    """The network's features with what the views agree on as further points, and what it says then.
+
+    Args:
+        backbone: the network, not adapted.
+        encoded: its features of the V views.
+        views: of which the wanted ones are told of.
+        priors: cameras, points, overlap.
+        config: settings; ``hints`` and ``consensus`` of them.
+        seed: of what is drawn.
+
+    Returns:
+        Features; the prediction of all views with them; and the further points of each view that has some.
+        Where the network takes no points, views are few, or none has any that is agreed on, the first is ``encoded``
+        itself, the second what the network says at first, and the third empty.
+    """
+    prediction, points = backbone.decode(encoded), dict[int, SparseDepth]()
+    if (
+        not backbone.uses_cameras
+        or priors.sparse is None
+        or priors.overlap is None
+        or len(views) < FEWEST_VIEWS
+    ):
+        return encoded, prediction, points
+    given, now = priors.sparse, encoded
+    for _ in range(config.hints.hint_rounds):
+        if backbone.with_points(encoded, {0: given[0]}) is encoded:
+            break
+        agreement = together(prediction, prediction.cameras, views, priors, config.consensus, seed).agreement
+        points = agreed_points(agreement, views, given, config, seed)
+        if not points:
+            return encoded, prediction, points
+        now = with_more(backbone, encoded, given, points)
+        if views.helpers:
+            part = backbone.decode(now, list(views.wanted), prediction)
+            prediction = merged(prediction, part)
+        else:
+            prediction = backbone.decode(now)
+    return now, prediction, points
+
+
+def with_more(
+    backbone: Backbone, encoded: Any, given: Sequence[SparseDepth], more: Mapping[int, SparseDepth]
+) -> Any:
+    """Features of the network with more points of some views than are ``given`` of all."""
+    if not more:
+        return encoded
+    return backbone.with_points(encoded, {i: joined(given[i], points) for i, points in more.items()})
+
+
+def joined(one: SparseDepth, other: SparseDepth) -> SparseDepth:
+    """All points of two sets, on the device of the first and of its types."""
+    pairs = ((getattr(one, name), getattr(other, name)) for name in ("xy", "depth", "sigma", "track"))
+    return SparseDepth(*(torch.cat([a, b.to(a)]) for a, b in pairs))
+
+
+def agreed_points(
+    agreement: Agreement, views: Views, given: Sequence[SparseDepth], config: TCOConfig, seed: int = 0
+) -> dict[int, SparseDepth]:
+    """Pixels of the wanted views whose agreed depths are known well, as points, on the CPU.
+
+    Args:
+        agreement: of all views, on the CPU. A pixel counts whose relative standard error is below
+            ``hint_error`` and whose confidence is not below ``hint_confidence``.
+        views: whose valid pixels count.
+        given: points of each view; pixels nearer to one than ``hint_distance`` do not count.
+        config: settings.
+        seed: of the pixels that are drawn of those that count, at most ``hint_points`` a view.
+
+    Returns:
+        By view; views without any are not in it.
+    """
+    c, found = config.hints, dict[int, SparseDepth]()
+    generator = torch.Generator().manual_seed(seed)
+    depths, confidence, error = (
+        x.cpu() for x in (agreement.prediction.depth, agreement.prediction.confidence, agreement.error)
+    )
+    valid = views.valid.cpu()
+    width = valid.shape[-1]
+    for i in views.wanted:
+        counts = valid[i] & (depths[i] > 0) & depths[i].isfinite()
+        counts &= (error[i] < c.hint_error) & (confidence[i] >= c.hint_confidence)
+        counts &= _far(given[i].xy, views.size, c.hint_distance * max(views.size))
+        pixels = counts.flatten().nonzero().squeeze(1)
+        pixels = pixels[torch.randperm(len(pixels), generator=generator)[: c.hint_points]]
+        if len(pixels):
+            xy = torch.stack([pixels % width, pixels // width], 1) + 0.5
+            depth, sigma = depths[i].flatten()[pixels], error[i].flatten()[pixels].clamp_min(LEAST)
+            found[i] = SparseDepth(xy, depth, sigma, torch.full_like(pixels, UNTRACKED))
+    return found
+
+
+def _far(xy: Tensor, size: tuple[int, int], distance: float) -> Tensor:
+    """Where (H, W) no point (N, 2) is nearer than so many pixels, counted from the pixel it is in."""
+    free = np.ones(size, bool)
+    columns, rows = np.floor(xy.cpu().numpy()).astype(int).T
+    free[rows.clip(0, size[0] - 1), columns.clip(0, size[1] - 1)] = False
+    if free.all():
+        return torch.from_numpy(free)
+    return torch.from_numpy(distance_transform_edt(free) >= distance)

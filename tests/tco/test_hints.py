@@ -1,0 +1,228 @@
+"""What the views agree on as further points: which pixels these are, and what the network is told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from tco.backbones.sweep import Encoded, Sweep
+from tco.backbones.weights import load_sweep
+from tco.consensus import Agreement
+from tco.hints import LEAST, UNTRACKED, agreed_points, joined, told, with_more
+from tco.optimize import optimize
+from tco.options import ConsensusConfig, HintsConfig, TCOConfig
+from tco.toy import Toy, Wall, wall
+from tco.types import Prediction, Priors, SparseDepth, Views
+
+PLAIN = TCOConfig(steps=0)
+
+
+@pytest.fixture
+def few_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many views as the rendered scene has are enough."""
+    monkeypatch.setattr("tco.hints.FEWEST_VIEWS", 5)
+
+
+def hints(**changes: float) -> TCOConfig:
+    return replace(PLAIN, hints=replace(HintsConfig(), **changes))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Wall:
+    return wall(4, (48, 64))
+
+
+@pytest.fixture(scope="module")
+def network() -> Sweep:
+    return load_sweep()
+
+
+@pytest.fixture(scope="module")
+def encoded(network: Sweep, rendered: tuple[Views, Priors, Tensor]) -> Encoded:
+    with torch.no_grad():
+        return network.encode(*rendered[:2])
+
+
+def agreement(scene: Wall, error: Tensor | float = 0.005, confidence: Tensor | float = 5.0) -> Agreement:
+    assert scene.priors.cameras is not None
+    every = torch.ones_like(scene.depth)
+    views = tuple(range(len(every)))
+    prediction = Prediction(scene.depth, every * confidence, scene.priors.cameras, views)
+    return Agreement(prediction, every * error)
+
+
+def given(scene: Wall, keep: int = 5) -> list[SparseDepth]:
+    assert scene.priors.sparse is not None
+    return [points[torch.arange(keep)] for points in scene.priors.sparse]
+
+
+def pixels(points: SparseDepth) -> tuple[Tensor, Tensor]:
+    """Rows and columns of points that are in the middle of a pixel."""
+    assert torch.equal(points.xy % 1, torch.full_like(points.xy, 0.5))
+    return points.xy[:, 1].long(), points.xy[:, 0].long()
+
+
+def test_points_are_pixels_with_their_depths(scene: Wall) -> None:
+    found = agreed_points(agreement(scene), scene.views, given(scene), hints(hint_points=50))
+    assert list(found) == [0, 1, 2, 3]
+    for i, points in found.items():
+        rows, columns = pixels(points)
+        assert len(points) == 50 and len(set(zip(rows.tolist(), columns.tolist(), strict=True))) == 50
+        assert torch.equal(points.depth, scene.depth[i, rows, columns])
+        assert torch.allclose(points.sigma, torch.tensor(0.005))
+        assert (points.track == UNTRACKED).all()
+
+
+def test_only_what_is_known_well_counts(scene: Wall) -> None:
+    """Error, confidence, validity and depth decide, each in a quarter of the picture of its own."""
+    error, confidence = torch.full((4, 48, 64), 0.005), torch.full((4, 48, 64), 5.0)
+    error[:, :, :16], confidence[:, :, 16:32] = 0.02, 1.2
+    valid = scene.views.valid.clone()
+    valid[:, :, 32:40] = False
+    what = agreement(scene, error, confidence)
+    depth = what.prediction.depth.clone()
+    depth[:, :, 40:44], depth[:, :, 44:48] = -1.0, float("nan")
+    what = replace(what, prediction=replace(what.prediction, depth=depth))
+    views = replace(scene.views, valid=valid)
+    config = hints(hint_points=10_000, hint_error=0.01, hint_confidence=1.3, hint_distance=0.0)
+    for points in agreed_points(what, views, given(scene), config).values():
+        assert len(points) == 48 * 16 and int(pixels(points)[1].min()) == 48
+
+
+def test_errors_have_a_floor(scene: Wall) -> None:
+    for points in agreed_points(agreement(scene, 1e-6), scene.views, given(scene), PLAIN).values():
+        assert torch.allclose(points.sigma, torch.tensor(LEAST))
+
+
+@pytest.mark.parametrize("distance", [0.05, 0.2])
+def test_points_keep_their_distance_from_colmaps(scene: Wall, distance: float) -> None:
+    config, known = hints(hint_points=10_000, hint_distance=distance), given(scene)
+    far = distance * 64
+    for i, points in agreed_points(agreement(scene), scene.views, known, config).items():
+        place = known[i].xy.floor() + 0.5
+        assert float(torch.cdist(points.xy, place).min()) >= far - 1e-4
+        rows, columns = torch.meshgrid(torch.arange(48), torch.arange(64), indexing="ij")
+        every = torch.stack([columns.flatten(), rows.flatten()], 1) + 0.5
+        assert len(points) == int((torch.cdist(every, place).amin(1) >= far - 1e-4).sum())
+
+
+def test_a_view_without_points_is_told_of_everywhere(scene: Wall) -> None:
+    known = [points[torch.arange(0)] for points in given(scene)]
+    config = hints(hint_points=10_000)
+    assert len(agreed_points(agreement(scene), scene.views, known, config)[0]) == 48 * 64
+
+
+def test_the_seed_draws_them(scene: Wall) -> None:
+    def drawn(seed: int) -> Tensor:
+        return agreed_points(agreement(scene), scene.views, given(scene), PLAIN, seed)[2].xy
+
+    assert torch.equal(drawn(3), drawn(3)) and not torch.equal(drawn(3), drawn(4))
+
+
+def test_views_that_help_are_not_told(scene: Wall) -> None:
+    views = replace(scene.views, helpers=2)
+    assert list(agreed_points(agreement(scene), views, given(scene), PLAIN)) == [0, 1]
+
+
+def test_nothing_agreed_is_no_point(scene: Wall) -> None:
+    nothing = agreement(scene, float("inf"))
+    assert agreed_points(nothing, scene.views, given(scene), PLAIN) == {}
+
+
+def test_joined_has_all_of_both(scene: Wall) -> None:
+    one, other = given(scene)[0], given(scene, 3)[1]
+    both = joined(one, other)
+    assert torch.equal(both.xy, torch.cat([one.xy, other.xy])) and len(both) == 8
+    assert torch.equal(both[torch.arange(5)].depth, one.depth)
+    assert torch.equal(both[torch.arange(5, 8)].track, other.track)
+
+
+@pytest.mark.usefixtures("few_views")
+def test_the_network_is_told_of_what_is_right(network: Sweep, rendered: tuple[Views, Priors, Tensor]) -> None:
+    views, priors, truth = rendered
+    assert priors.sparse is not None
+    few = replace(priors, sparse=tuple(points[::8] for points in priors.sparse))
+    with torch.no_grad():
+        start = network.encode(views, few)
+    now, second, points = told(network, start, views, few, PLAIN)
+    assert sum(map(len, points.values())) > 200
+    pairs = [(p.depth, truth[i][pixels(p)]) for i, p in points.items()]
+    depth, true = (torch.cat(part) for part in zip(*pairs, strict=True))
+    error = (depth / true - 1).abs()[true > 0]
+    assert float((error < 0.02).float().mean()) > 0.8
+    with torch.no_grad():
+        again = network.decode(with_more(network, start, few.sparse or (), points))
+    assert torch.equal(again.depth, second.depth) and torch.equal(
+        network.decode(now).depth.detach(), second.depth
+    )
+
+
+@pytest.mark.usefixtures("few_views")
+def test_no_round_is_the_network_alone(
+    network: Sweep, encoded: Encoded, rendered: tuple[Views, Priors, Tensor]
+) -> None:
+    now, prediction, points = told(network, encoded, *rendered[:2], hints(hint_rounds=0))
+    with torch.no_grad():
+        plain = network.decode(encoded)
+    assert now is encoded and points == {} and torch.equal(prediction.depth, plain.depth)
+
+
+def test_few_views_are_asked_once(
+    network: Sweep, encoded: Encoded, rendered: tuple[Views, Priors, Tensor]
+) -> None:
+    assert len(rendered[0]) == 5
+    now, _, points = told(network, encoded, *rendered[:2], PLAIN)
+    assert now is encoded and points == {}
+
+
+@pytest.mark.usefixtures("few_views")
+def test_nobody_to_agree_with_is_the_network_alone(
+    network: Sweep, encoded: Encoded, rendered: tuple[Views, Priors, Tensor]
+) -> None:
+    config = replace(PLAIN, consensus=ConsensusConfig(consensus_rounds=0))
+    now, _, points = told(network, encoded, *rendered[:2], config)
+    assert now is encoded and points == {}
+
+
+def test_a_network_that_takes_no_points_is_asked_once(scene: Wall) -> None:
+    class Counting(Toy):
+        decoded = 0
+
+        def decode(self, *args: object, **kwargs: object) -> Prediction:
+            self.decoded += 1
+            return super().decode(*args, **kwargs)  # type: ignore[arg-type]
+
+    toy = Counting()
+    features = toy.encode(scene.views, scene.priors)
+    now, _, points = told(toy, features, scene.views, scene.priors, PLAIN)
+    assert now is features and points == {} and toy.decoded == 1
+
+
+@pytest.mark.usefixtures("few_views")
+def test_helpers_stay_as_the_network_said_first(
+    network: Sweep, encoded: Encoded, rendered: tuple[Views, Priors, Tensor]
+) -> None:
+    views, priors, _ = rendered
+    _, prediction, points = told(network, encoded, replace(views, helpers=2), priors, PLAIN)
+    with torch.no_grad():
+        plain = network.decode(encoded)
+    assert set(points) <= {0, 1, 2} and points
+    assert torch.equal(prediction.depth[3:], plain.depth[3:])
+    assert not torch.equal(prediction.depth[:3], plain.depth[:3])
+
+
+@pytest.mark.usefixtures("few_views")
+def test_optimisation_starts_from_what_it_was_told(
+    network: Sweep, encoded: Encoded, rendered: tuple[Views, Priors, Tensor]
+) -> None:
+    """Without steps the prediction is the told one; steps of no size on the network lead back to it."""
+    views, priors, _ = rendered
+    _, prediction, points = told(network, encoded, views, priors, PLAIN)
+    outcome = optimize(network, views, priors, PLAIN)
+    assert torch.equal(outcome.prediction.depth, prediction.depth) and outcome.told.keys() == points.keys()
+    still = replace(PLAIN, steps=2, rate=0.0, camera_rate=0.0)
+    still = replace(still, polish=replace(still.polish, polish_looks=0))
+    assert torch.equal(optimize(network, views, priors, still).prediction.depth, prediction.depth)
