@@ -136,7 +136,7 @@ def predict_chunk(
         }
         maps = view_maps(view, prediction, i, images.valid, frame.scale, error, num_threads)
         before = view_maps(view, own, i, images.valid, frame.scale, num_threads=num_threads)
-        figures |= _asked(own.depth[i], flat, i, images.valid[i])
+        figures |= _asked(own.depth[i], flat, i, images.valid[i], outcome)
         corrected = corrected_view(view, frame.scale, cameras, moved, i)
         results[view.name] = ViewResult(maps, before, figures, corrected)
     if aligned is not None:
@@ -148,12 +148,13 @@ def predict_chunk(
     return ChunkResult(results, outcome.history, {})
 
 
-def _asked(own: Tensor, flat: OnPlanes, i: int, valid: Tensor) -> dict[str, object]:
-    """By how much others moved the depths of view ``i``, of what share enough spoke, what is on planes."""
+def _asked(own: Tensor, flat: OnPlanes, i: int, valid: Tensor, outcome: Outcome) -> dict[str, object]:
+    """What others said of view ``i``: further points, by how much its depths moved, what is on planes."""
     after, spread = flat.before.prediction.depth[i], flat.before.error[i]
     known = valid & (own > 0) & (after > 0)
     moved = (after[known] / own[known]).log().abs()
     return {
+        "points_agreed": len(outcome.told[i]) if i in outcome.told else 0,
         "moved_by_consensus": _median(moved),
         "asked_by_consensus": float(spread.isfinite()[valid].float().mean()),
         "on_planes": float((flat.labels[i] > 0)[valid].float().mean()),

@@ -51,8 +51,8 @@ def told(
 
     Returns:
         Features; the prediction of all views with them; and the further points of each view that has some.
-        Where the network takes no points, views are few, or none has any that is agreed on, the first is ``encoded``
-        itself, the second what the network says at first, and the third empty.
+        Where the network takes no points, views are few, or none has any that is agreed on: ``encoded``
+        itself, what the network says at first, and none.
     """
     prediction, points = backbone.decode(encoded), dict[int, SparseDepth]()
     if (
