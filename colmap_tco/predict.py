@@ -114,11 +114,10 @@ def predict_chunk(
         watched=[points.to(device) for points in priors.held_out],
     )
     assert priors.optimise.sparse is not None
-    own, flat = concluded(outcome, there, priors.optimise, tco_config, seed)
+    flat = concluded(outcome, there, priors.optimise, tco_config, seed)
     prediction, error = flat.agreement.prediction, flat.agreement.error
-    own, moved = own.to("cpu"), outcome.cameras.to("cpu")
-    used = errors_at_points(prediction, priors.optimise.sparse)
-    held = errors_at_points(prediction, priors.held_out)
+    own, moved = outcome.prediction.to("cpu"), outcome.cameras.to("cpu")
+    used, held = (errors_at_points(prediction, p) for p in (priors.optimise.sparse, priors.held_out))
     results = {}
     for i in range(len(chunk.owned)):
         view = members[i]

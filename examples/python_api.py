@@ -53,14 +53,13 @@ def reconstruct(root: Path, size: int, config: TCOConfig) -> tuple[Cloud, dict[s
     outcome = optimize(network, views, priors.optimise, config)
 
     # Consensus: each pixel's depth by what all views that see the place say of it; then planes among these.
-    own_depths, flat = concluded(outcome, views, priors.optimise, config)
-    agreement = flat.agreement
+    agreement = concluded(outcome, views, priors.optimise, config).agreement
     errors = torch.cat(errors_at_points(agreement.prediction, priors.held_out))
 
     # Back to COLMAP's units, with a normal for each depth.
     own, maps = (
         [view_maps(v, prediction, i, views.valid, frame.scale, error) for i, v in enumerate(images)]
-        for prediction, error in ((own_depths, None), (agreement.prediction, agreement.error))
+        for prediction, error in ((outcome.prediction, None), (agreement.prediction, agreement.error))
     )
 
     # Fusion: what several views found each by itself, gaps filled with what they agreed on; coloured from the

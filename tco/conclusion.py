@@ -3,8 +3,12 @@
 Refinement (:mod:`tco.polish`) brings depths nearer to the truth where the pictures have texture, and moves
 them at random where they have none: there colours say nothing and any step is as good. What it did is told by
 asking the views together (:mod:`tco.consensus`) with the depths of before and with those of after: where it
-did harm they lie further apart. So a pixel takes its depth of before if around it the views' standard error
-has grown by more than a factor.
+did harm they lie further apart. So a pixel takes what the views said together before if around it their
+standard error has grown by more than a factor. It keeps the larger error: that depths can be moved about
+without colours objecting is a reason to doubt them.
+
+Each view's own depths stay refined everywhere: fusion takes what several find alike, and depths that were
+moved at random are not among that.
 """
 
 from __future__ import annotations
@@ -32,10 +36,8 @@ LEAST, MOST = 1e-4, 0.5
 """Bounds of a standard error there; where too few views spoke it is the larger one."""
 
 
-def concluded(
-    outcome: Outcome, views: Views, priors: Priors, config: TCOConfig, seed: int = 0
-) -> tuple[Prediction, OnPlanes]:
-    """Each view's own depths, refined or not, and what the views say together, on planes where it is flat.
+def concluded(outcome: Outcome, views: Views, priors: Priors, config: TCOConfig, seed: int = 0) -> OnPlanes:
+    """What the views say together, with refined depths or those of before, on planes where it is flat.
 
     Args:
         outcome: of :func:`tco.optimize.optimize`.
@@ -53,10 +55,10 @@ def concluded(
     if outcome.before is not None and growth > 0 and agreement.prediction is not prediction:
         before = agreed(outcome.before, cameras, views, priors, config.consensus)
         keep = grown(before.error, agreement.error) <= growth
-        prediction = _where(keep, prediction, outcome.before)
         depths = _where(keep, agreement.prediction, before.prediction)
-        agreement = Agreement(depths, agreement.error.where(keep, before.error))
-    return prediction, on_planes(agreement, prediction, cameras, views, config.consensus, seed)
+        doubt = torch.maximum(agreement.error, before.error)
+        agreement = Agreement(depths, agreement.error.where(keep, doubt))
+    return on_planes(agreement, prediction, cameras, views, config.consensus, seed)
 
 
 def grown(before: Tensor, after: Tensor) -> Tensor:

@@ -74,7 +74,7 @@ class PolishConfig:
     """Refinement of each pixel's depth after the network was adapted (``tco/polish.py``)."""
 
     polish_looks: int = knob(
-        6,
+        10,
         "times that each view's depths are refined, after the steps on the network; 0, or no steps at all: "
         "never",
     )

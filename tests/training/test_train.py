@@ -18,6 +18,7 @@ from tco.backbones.weights import load_sweep
 from training import train
 from training.dataset import load, write
 from training.train import (
+    CONTRAST,
     TrainConfig,
     Trainer,
     coarse_loss,
@@ -37,8 +38,9 @@ TINY = SweepConfig(
 CONFIG = TrainConfig(steps=40, warmup=2, sizes=((0.0, 96, 128),), refined=1, held_out=1)
 
 
-def tiny() -> Sweep:
-    return Sweep(TINY)
+def tiny(told: SweepConfig = TINY) -> Sweep:
+    """A small network, with what the trainer wants of the pictures."""
+    return Sweep(replace(TINY, equalise=told.equalise))
 
 
 @pytest.fixture(scope="module")
@@ -223,7 +225,7 @@ def test_a_run_ends_with_weights_that_the_package_loads(data: Path, tmp_path: Pa
     trainer = Trainer(replace(CONFIG, steps=4), [data], tmp_path)
     trainer.run(every=2, validation=4)
     loaded = load_sweep(tmp_path / "weights.safetensors")
-    assert loaded.config == TINY
+    assert loaded.config == replace(TINY, equalise=CONTRAST)
     assert same(loaded.state_dict(), trainer.mean.state_dict())
     lines = (tmp_path / "log.csv").read_text().splitlines()
     assert lines[0].split(",")[:2] == ["step", "kind"]
