@@ -1,4 +1,4 @@
-"""What it gives to equalise pictures, to tell the network what views agree on, to take depths back.
+"""What it gives to equalise pictures, to tell what views agree on, to take refined depths back.
 
     python -m benchmarks.hints [--output docs/hints.md]
 
@@ -109,12 +109,11 @@ def main() -> None:
             worst = min(figures[s][1] - first[s][1] for s in drawn)
             cells += [f"{mean[0]:.3f} {mean[1]:.3f}", f"{worst:+.3f}"]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    count = len(first) - len(args.sets)
     told = (
         f"`python -m benchmarks.hints`: {weights_told(weights)}, {args.size} pixels, "
-        f"{args.views or 'all'} views, {args.steps} steps. Shares of the measured pixels within 2 and 5 %. random: mean of {count} scenes of "
-        "the training's kinds, 10 views each, that no training saw; worst: the lowest change of the share within "
-        "5 % among these against the first row."
+        f"{args.views or 'all'} views, {args.steps} steps. Shares of the measured pixels within 2 and 5 %. "
+        f"random: mean of {len(first) - len(args.sets)} scenes of the training's kinds, 10 views each, that no "
+        "training saw; worst: the lowest change of the share within 5 % among these against the first row."
     )
     text = "# What views agree on\n\n" + paragraph(told) + "\n" + "\n".join(lines) + "\n"
     publish(text, args.output, args.part)
