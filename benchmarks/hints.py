@@ -113,8 +113,8 @@ def main() -> None:
         f"`python -m benchmarks.hints`: {weights_told(weights)}, {args.size} pixels, "
         f"{args.views or 'all'} views, {args.steps} steps. Shares of the measured pixels within 2 and 5 %. "
         f"random: mean of {len(first) - len(args.sets)} scenes of the training's kinds, 10 views each, "
-        "that no training saw; worst: the lowest change of the share within 5 % among these against the first "
-        "row."
+        "that no training saw; worst: the lowest change of the share within 5 % among these against the "
+        "first row."
     )
     text = "# What views agree on\n\n" + paragraph(told) + "\n" + "\n".join(lines) + "\n"
     publish(text, args.output, args.part)
