@@ -25,6 +25,7 @@ from tco.consensus import Agreement
 from tco.context import merged
 from tco.options import TCOConfig
 from tco.planar.run import together
+from tco.polish import displacement
 from tco.types import Prediction, Priors, SparseDepth, Views
 
 LEAST = 0.003
@@ -51,16 +52,14 @@ def told(
 
     Returns:
         Features; the prediction of all views with them; and the further points of each view that has some.
-        Where the network takes no points, views are few, or none has any that is agreed on: ``encoded``
-        itself, what the network says at first, and none.
+        Where the network takes no points, views are few, cameras are uncertain, or no view has any pixel that
+        is agreed on: ``encoded`` itself, what the network says at first, and none.
     """
     prediction, points = backbone.decode(encoded), dict[int, SparseDepth]()
-    if (
-        not backbone.uses_cameras
-        or priors.sparse is None
-        or priors.overlap is None
-        or len(views) < FEWEST_VIEWS
-    ):
+    if priors.cameras is None or priors.sparse is None or priors.overlap is None:
+        return encoded, prediction, points
+    uncertain = displacement(priors, views.size) > config.consensus.consensus_uncertainty
+    if not backbone.uses_cameras or len(views) < FEWEST_VIEWS or uncertain:
         return encoded, prediction, points
     given, now = priors.sparse, encoded
     for _ in range(config.hints.hint_rounds):

@@ -187,6 +187,17 @@ def test_nobody_to_agree_with_is_the_network_alone(
     assert now is encoded and points == {}
 
 
+@pytest.mark.usefixtures("few_views")
+def test_uncertain_cameras_are_the_network_alone_without_a_word(
+    network: Sweep, encoded: Encoded, rendered: tuple[Views, Priors, Tensor], caplog: pytest.LogCaptureFixture
+) -> None:
+    """The consensus after the optimisation says it once."""
+    views, priors, _ = rendered
+    unsure = replace(priors, rotation_sigma=torch.full((len(views),), 0.1))
+    now, _, points = told(network, encoded, views, unsure, PLAIN)
+    assert now is encoded and points == {} and not caplog.records
+
+
 def test_a_network_that_takes_no_points_is_asked_once(scene: Wall) -> None:
     class Counting(Toy):
         decoded = 0
