@@ -29,8 +29,8 @@ def equalised(images: Tensor, valid: Tensor, gain: float) -> Tensor:
 
     Args:
         images: (V, 3, H, W) in [0, 1].
-        valid: (V, H, W) pixels that show something. Others take part as the mean of these and come back
-            as they were.
+        valid: (V, H, W) pixels that show something. Others, and those that are not finite, take part as the
+            mean of these and come back as they were.
         gain: factor that differences of brightness may grow by, at most; 0 changes nothing.
 
     Returns:
@@ -39,12 +39,14 @@ def equalised(images: Tensor, valid: Tensor, gain: float) -> Tensor:
     if gain == 0:
         return images
     weights = images.new_tensor(LUMA).view(3, 1, 1)
-    brightness = (images * weights).sum(1).clamp(0, 1)
-    count = valid.sum((1, 2), keepdim=True).clamp_min(1)
-    mean = (brightness * valid).sum((1, 2), keepdim=True) / count
-    grey = brightness.where(valid, mean).detach().float().cpu().numpy()
+    brightness = (images * weights).sum(1)
+    known = valid & brightness.isfinite()
+    brightness = brightness.where(known, torch.zeros_like(brightness)).clamp(0, 1)
+    mean = brightness.sum((1, 2), keepdim=True) / known.sum((1, 2), keepdim=True).clamp_min(1)
+    brightness = brightness.where(known, mean)
+    grey = brightness.detach().float().cpu().numpy()
     spread = torch.from_numpy(np.stack([_equalised(one, gain) for one in grey])).to(images)
-    return images + ((spread - brightness) * valid).unsqueeze(1)
+    return images + ((spread - brightness) * known).unsqueeze(1)
 
 
 def _equalised(grey: NDArray[np.float32], gain: float) -> NDArray[np.float32]:

@@ -516,7 +516,7 @@ def assert_far_pixels_are_dropped(result: Densified, root: Path, ratio: float) -
     far = 0
     for name, reach in reaches(read_tracks(workspace.model), views).items():
         own = read_map(DensePaths(result.folder).own_maps(name)[0])
-        far += int((own > ratio * reach).sum())
+        far += int((own.astype(np.float64) > ratio * reach).sum())  # as compiled loops compare
     assert result.report["fusion"]["pixels"]["max_depth_ratio"] == far > 1000
 
 

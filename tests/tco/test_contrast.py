@@ -95,6 +95,18 @@ def test_what_is_not_valid_stays_and_has_no_say() -> None:
     assert torch.allclose(first[:, :, :, :60], second[:, :, :, :60], atol=1e-6)
 
 
+def test_what_is_no_number_stays_and_harms_nothing_else() -> None:
+    images = torch.rand(1, 3, 64, 96, generator=torch.Generator().manual_seed(1))
+    broken = images.clone()
+    broken[0, 1, 10, 20], broken[0, 0, 11, 20] = float("nan"), float("inf")
+    hole = everywhere(images)
+    hole[0, 10, 20] = hole[0, 11, 20] = False
+    first, second = equalised(broken, everywhere(images), 10.0), equalised(images, hole, 10.0)
+    there = hole.unsqueeze(1).expand(1, 3, 64, 96)
+    assert bool(first[0, 1, 10, 20].isnan()) and bool(first[there].isfinite().all())
+    assert torch.allclose(first[there], second[there], atol=1e-6)
+
+
 def test_a_view_of_nothing_stays_as_it_is() -> None:
     images = noise(0.5)
     assert torch.equal(equalised(images, ~everywhere(images), 10.0), images)
