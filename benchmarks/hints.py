@@ -110,7 +110,8 @@ def main() -> None:
             cells += [f"{mean[0]:.3f} {mean[1]:.3f}", f"{worst:+.3f}"]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     told = (
-        f"`python -m benchmarks.hints`: {weights_told(weights)}, {args.size} pixels, "
+        f"`python -m benchmarks.hints --sets {' '.join(args.sets)} --random {args.random}`: "
+        f"{weights_told(weights)}, {args.size} pixels, "
         f"{args.views or 'all'} views, {args.steps} steps. Shares of the measured pixels within 2 and 5 %. "
         f"random: mean of {len(first) - len(args.sets)} scenes of the training's kinds, 10 views each, "
         "that no training saw; worst: the lowest change of the share within 5 % among these against the "
