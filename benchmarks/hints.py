@@ -31,7 +31,7 @@ Shares = tuple[float, float]
 Case = tuple[str, Views, Priors, Tensor, TCOConfig]
 
 
-def without(config: TCOConfig, **changes: Any) -> TCOConfig:
+def changed(config: TCOConfig, **changes: Any) -> TCOConfig:
     """The settings with other ones of the hints (``hint_…``) and of the refinement."""
     hints = {name: value for name, value in changes.items() if name.startswith("hint_")}
     polish = {name: value for name, value in changes.items() if name.startswith("polish_")}
@@ -62,19 +62,19 @@ def rows(networks: tuple[Sweep, Sweep], case: Case) -> Iterator[tuple[str, Share
     """Each variant of one set, by networks that see pictures as they are and equalised."""
     plain, equalised = networks
     _, views, priors, _, config = case
-    alone, told = without(config, hint_rounds=0), config
+    alone, told = changed(config, hint_rounds=0), config
 
     def predicted(network: Sweep, config: TCOConfig) -> Callable[[TCOConfig], Shares]:
         outcome = optimize(network, views, priors, config)
         return lambda settings: shares(outcome, case, settings)
 
     of = predicted(plain, alone)
-    yield "pictures as they are, COLMAP's points, all refined depths", of(without(alone, polish_growth=0.0))
+    yield "pictures as they are, COLMAP's points, all refined depths", of(changed(alone, polish_growth=0.0))
     of = predicted(equalised, alone)
-    yield "equalised pictures", of(without(alone, polish_growth=0.0))
+    yield "equalised pictures", of(changed(alone, polish_growth=0.0))
     yield "equalised, refined depths taken back", of(alone)
     of = predicted(equalised, told)
-    yield "equalised, told", of(without(told, polish_growth=0.0))
+    yield "equalised, told", of(changed(told, polish_growth=0.0))
     yield "default: equalised, told, taken back", of(told)
     unoptimised = replace(told, steps=0)
     yield "default without optimisation", predicted(equalised, unoptimised)(unoptimised)

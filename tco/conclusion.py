@@ -25,7 +25,7 @@ from tco.consensus import Agreement, agreed
 from tco.options import TCOConfig
 from tco.planar.run import OnPlanes, on_planes
 from tco.planar.view import SIDE
-from tco.types import Prediction, Priors, Views
+from tco.types import Priors, Views
 
 if TYPE_CHECKING:
     from tco.optimize import Outcome
@@ -55,9 +55,9 @@ def concluded(outcome: Outcome, views: Views, priors: Priors, config: TCOConfig,
     if outcome.before is not None and growth > 0 and agreement.prediction is not prediction:
         before = agreed(outcome.before, cameras, views, priors, config.consensus)
         keep = grown(before.error, agreement.error) <= growth
-        depths = _where(keep, agreement.prediction, before.prediction)
-        doubt = torch.maximum(agreement.error, before.error)
-        agreement = Agreement(depths, agreement.error.where(keep, doubt))
+        depth = agreement.prediction.depth.where(keep, before.prediction.depth)
+        error = agreement.error.where(keep, torch.maximum(agreement.error, before.error))
+        agreement = Agreement(replace(agreement.prediction, depth=depth), error)
     return on_planes(agreement, prediction, cameras, views, config.consensus, seed)
 
 
@@ -67,13 +67,3 @@ def grown(before: Tensor, after: Tensor) -> Tensor:
     r = max(1, round(AROUND * side / SIDE))
     change = (after.clamp(LEAST, MOST) / before.clamp(LEAST, MOST)).log().unsqueeze(1)
     return F.avg_pool2d(change, 2 * r + 1, 1, r, count_include_pad=False).squeeze(1).exp()
-
-
-def _where(keep: Tensor, one: Prediction, other: Prediction) -> Prediction:
-    """The one with the other's depths and confidences where not ``keep``."""
-    return replace(
-        one,
-        depth=torch.where(keep, one.depth, other.depth),
-        confidence=torch.where(keep, one.confidence, other.confidence),
-        stages=(),
-    )

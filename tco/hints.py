@@ -62,13 +62,15 @@ def told(
     if not backbone.uses_cameras or len(views) < FEWEST_VIEWS or uncertain:
         return encoded, prediction, points
     given, now = priors.sparse, encoded
-    for _ in range(config.hints.hint_rounds):
-        if backbone.with_points(encoded, {0: given[0]}) is encoded:
-            break
+    rounds = config.hints.hint_rounds
+    if rounds and backbone.with_points(encoded, {0: given[0]}) is encoded:
+        return encoded, prediction, points
+    for _ in range(rounds):
         agreement = together(prediction, prediction.cameras, views, priors, config.consensus, seed).agreement
-        points = agreed_points(agreement, views, given, config, seed)
-        if not points:
-            return encoded, prediction, points
+        found = agreed_points(agreement, views, given, config, seed)
+        if not found:
+            break
+        points = found
         now = with_more(backbone, encoded, given, points)
         if views.helpers:
             part = backbone.decode(now, list(views.wanted), prediction)

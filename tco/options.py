@@ -180,7 +180,7 @@ class HintsConfig:
     hint_rounds: int = knob(
         1,
         "times that a network that takes points is asked again, with further ones where the views agreed on "
-        "what it said before; 0: it is given COLMAP's points alone",
+        "what it said before, in groups of eight views or more; 0: it is given COLMAP's points alone",
     )
     hint_points: int = knob(300, "further points of a view, at most")
     hint_error: float = knob(0.01, "largest relative standard error of an agreed depth that becomes a point")
@@ -291,7 +291,7 @@ class TCOConfig:
         check_range(self, "reencode stop_after occlusion_tolerance", 0)
 
     def reference_schedule(self) -> TCOConfig:
-        """The same objective on the published schedule.
+        """The same objective on the published schedule, by a network that is asked once.
 
         A source drawn uniformly, all blocks run and all views decoded with gradients in every step, every
         other view a target. What the network multiplies in is its own (``dtype`` of what loads it).
@@ -300,5 +300,5 @@ class TCOConfig:
         ablation = replace(self.ablation, decode_all=True, source_order="uniform", run_ahead=False)
         return replace(
             self, sources=1, targets=EVERY, refresh=1, ablation=ablation,
-            polish=PolishConfig(polish_looks=0),
+            polish=PolishConfig(polish_looks=0), hints=replace(self.hints, hint_rounds=0),
         )  # fmt: skip

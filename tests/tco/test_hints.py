@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -210,6 +211,26 @@ def test_a_network_that_takes_no_points_is_asked_once(scene: Wall) -> None:
     features = toy.encode(scene.views, scene.priors)
     now, _, points = told(toy, features, scene.views, scene.priors, PLAIN)
     assert now is features and points == {} and toy.decoded == 1
+
+
+@pytest.mark.usefixtures("few_views")
+def test_a_round_that_finds_nothing_keeps_what_the_one_before_found(
+    network: Sweep, encoded: Encoded, rendered: tuple[Views, Priors, Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    once = told(network, encoded, *rendered[:2], PLAIN)
+    asked: list[Agreement] = []
+
+    def first_time_alone(what: Agreement, *args: Any) -> dict[int, SparseDepth]:
+        asked.append(what)
+        return agreed_points(what, *args) if len(asked) == 1 else {}
+
+    monkeypatch.setattr("tco.hints.agreed_points", first_time_alone)
+    now, prediction, points = told(network, encoded, *rendered[:2], hints(hint_rounds=2))
+    assert (
+        len(asked) == 2 and points.keys() == once[2].keys() and torch.equal(prediction.depth, once[1].depth)
+    )
+    with torch.no_grad():
+        assert torch.equal(network.decode(now).depth, prediction.depth)
 
 
 @pytest.mark.usefixtures("few_views")
