@@ -16,6 +16,9 @@ What agrees afterwards is no evidence any more, for all views were asked: who wa
 found independently of each other, as fusion does, takes the depths from before. How far apart they were is
 kept as the standard error of what they say together, as if they erred each by itself.
 
+On a CPU a compiled loop does it pixel by pixel; elsewhere, and in float64, tensor operations, with which it
+agrees to rounding.
+
 Medians of aligned depth maps: Merrell et al., Real-time visibility-based fusion of depth maps, ICCV 2007.
 """
 
@@ -24,12 +27,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from tco.geometry import invert, pixel_grid, project, rays, sample, transform
 from tco.options import ConsensusConfig
+from tco.parallel import in_ranges
 from tco.polish import too_uncertain
 from tco.schedule import most_overlapping
 from tco.types import Cameras, Prediction, Priors, Views
@@ -107,12 +112,14 @@ def agreed(
     known = torch.isfinite(prediction.depth) & (prediction.depth > 0)
     depth = prediction.depth.where(known, torch.ones_like(prediction.depth))
     counts = (views.valid & known & smooth(depth)).to(depth)
-    evidence = torch.stack([1 / depth, prediction.confidence, counts], 1)
+    loops = depth.device.type == "cpu" and depth.dtype == torch.float32
+    evidence = torch.stack([1 / depth, prediction.confidence, counts], -1 if loops else 1)
+    ask = _asked_in_loops if loops else _asked
     moved = prediction.depth.clone()
     for view in views.wanted:
         others = most_overlapping(priors.overlap, view, config.consensus_views)
         if others:
-            asked, spread = _asked(evidence, cameras, view, others, config)
+            asked, spread = ask(evidence, cameras, view, others, config)
             moved[view] = asked.where(known[view], moved[view])
             error[view] = spread.where(known[view], error[view])
     return Agreement(replace(prediction, depth=moved, stages=()), error)
@@ -155,6 +162,30 @@ def _asked(
             depth = depth * torch.exp(robust_mean(said, weights, config.consensus_width, middle))
         found.append(torch.stack([depth, standard_error(said, weights, middle)]))
     depth, error = torch.cat(found, 1).reshape(2, h, w)
+    return depth, error
+
+
+def _asked_in_loops(
+    evidence: Tensor, cameras: Cameras, view: int, others: list[int], config: ConsensusConfig
+) -> tuple[Tensor, Tensor]:
+    """:func:`_asked` by a compiled loop; the evidence (V, H, W, 3) is in float32 on the CPU."""
+    from tco._consensus_kernels import Asked, Rules, ask
+
+    h, w = evidence.shape[1:3]
+    ray = rays(pixel_grid(h, w, evidence).reshape(-1, 2), cameras.K[view]).contiguous().numpy()
+    other_from_view = invert(cameras.world_from_cam[others]) @ cameras.world_from_cam[view]
+    K, poses = cameras.K[others].double(), other_from_view[:, :3].double().contiguous()
+    intrinsics = torch.stack([K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2]], 1)
+    asked = Asked(evidence.numpy(), np.array(others), poses.numpy(), intrinsics.numpy())
+    reach = config.consensus_reach
+    rules = Rules(
+        config.consensus_rounds, math.exp(-reach), math.exp(reach), config.consensus_width, ALL, HALF, FEWEST,
+        SIGMA_OF_MAD * OF_MEDIAN,
+    )  # fmt: skip
+    own, out = evidence[view].reshape(-1, 3).numpy(), evidence.new_empty(2, h * w)
+    into = out.numpy()
+    in_ranges(lambda *pixels: ask(own, ray, asked, rules, pixels, into), h * w)
+    depth, error = out.reshape(2, h, w)
     return depth, error
 
 

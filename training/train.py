@@ -23,6 +23,9 @@ from torch import Tensor
 from tco.backbones.decoder import SweepConfig
 from tco.backbones.sweep import Encoded, Stage, Sweep
 from tco.backbones.sweeping import BACKGROUND
+from tco.hints import agreed_points, with_more
+from tco.options import TCOConfig
+from tco.planar.run import together
 from tco.types import Priors, Views
 from training.dataset import load
 from training.loop import Loop, LoopConfig, arguments, launch
@@ -40,10 +43,13 @@ class TrainConfig(LoopConfig):
     Attributes:
         share: of the samples that have the size reached last; the others keep the size before.
         refined: views a step whose refinement is trained; all views train the coarse stage.
+        told: share of the samples with what their views agree on as further points (:mod:`tco.hints`), which
+            are the network's own, with its own mistakes.
     """
 
     share: float = 0.75
     refined: int = 3
+    told: float = 0.5
 
 
 def pooled(depth: Tensor, factor: int) -> Tensor:
@@ -113,10 +119,24 @@ def slope_loss(stage: Stage, truth: Tensor, floor: Tensor) -> Tensor:
     return total
 
 
-def losses(net: Sweep, sample: tuple, refined: list[int], sources: int) -> tuple[Tensor, dict[str, float]]:
-    """Total loss of one sample, and figures for the log."""
+@torch.no_grad()
+def with_agreed(net: Sweep, encoded: Encoded, views: Views, priors: Priors, seed: int) -> Encoded:
+    """The features with what all views agree on as further points, as in a run."""
+    assert priors.sparse is not None
+    config, first = TCOConfig(), net.decode(encoded)
+    agreement = together(first, first.cameras, views, priors, config.consensus, seed).agreement
+    more = agreed_points(agreement, views, priors.sparse, config, seed)
+    return replace(encoded, hints=with_more(net, encoded, priors.sparse, more).hints)
+
+
+def losses(
+    net: Sweep, sample: tuple, refined: list[int], sources: int, told: int | None = None
+) -> tuple[Tensor, dict[str, float]]:
+    """Total loss of one sample, and figures for the log; ``told``, if any, is the seed of further points."""
     views, priors, depth = sample
     encoded = net.encode(views, priors, sources)
+    if told is not None:
+        encoded = with_agreed(net, encoded, views, priors, told)
     first = net.coarse(encoded, range(len(views)))
     depth, floor = with_sky(depth, encoded)
     total = coarse_loss(first, encoded, pooled(depth, 4))
@@ -202,7 +222,9 @@ class Trainer(Loop):
         sample, rng = self.drawn()
         self.shown += 1
         refined = sorted(rng.choice(len(sample[0]), self.config.refined, replace=False).tolist())
-        return losses(self.net, sample, refined, int(rng.integers(2, len(sample[0]))))
+        sources = int(rng.integers(2, len(sample[0])))
+        told = int(rng.integers(2**31)) if rng.random() < self.config.told else None
+        return losses(self.net, sample, refined, sources, told)
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
@@ -225,9 +247,11 @@ def main() -> None:
     """Command line of the trainer."""
     parser = arguments(__doc__ or "", TrainConfig())
     parser.add_argument("--share", type=float, default=TrainConfig.share, help="of the size reached last")
+    parser.add_argument("--told", type=float, default=TrainConfig.told, help="of what views agree on")
     parser.add_argument("--workers", type=int, default=2, help="processes that share each step")
     args = parser.parse_args()
     config = TrainConfig(steps=args.steps, rate=args.rate, minutes=args.minutes, share=args.share)
+    config = replace(config, told=args.told)
     if args.sizes is not None:
         config = replace(config, sizes=tuple(tuple(s) for s in json.loads(args.sizes.read_text())))
     launch(partial(trainer, config, args.data, args.out, args.device), args, args.workers)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from tco.geometry import invert, pixel_grid
@@ -123,12 +124,23 @@ def interpolate_points(
             1 / points.depth[pick].to(like),
             points.sigma[pick].to(like),
         )
-        k = min(6, len(pick))
-        parts = [torch.cdist(block, xy).topk(k, largest=False) for block in grid.split(8192)]
-        d, index = torch.cat([p[0] for p in parts]) / unit, torch.cat([p[1] for p in parts])
+        d, index = nearest_points(grid, xy, min(6, len(pick)))
+        d = d / unit
         weight = 1 / (1 + d**2) / sigma[index].clamp_min(1e-3)
         nearest.append(inv[index[:, 0]])
         smooth.append((weight * inv[index]).sum(1) / weight.sum(1))
         distance.append(torch.log1p(d[:, 0]))
     stacked = (torch.stack(x).reshape(len(sparse), h, w) for x in (nearest, smooth, distance))
     return Hints(*stacked)
+
+
+def nearest_points(places: Tensor, xy: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Distances, the least first, and indices (N, count) of the points (M, 2) nearest to places (N, 2)."""
+    if places.device.type == "cpu":
+        distance, index = KDTree(xy.numpy()).query(places.numpy(), list(range(1, count + 1)))
+        return torch.from_numpy(distance).to(places), torch.from_numpy(index)
+    exact = "donot_use_mm_for_euclid_dist"
+    parts = [
+        torch.cdist(block, xy, compute_mode=exact).topk(count, largest=False) for block in places.split(8192)
+    ]
+    return torch.cat([p[0] for p in parts]), torch.cat([p[1] for p in parts])

@@ -6,8 +6,6 @@ Nothing here is differentiable in the cameras or the hypotheses, only in the fea
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -16,6 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from tco.geometry import pixel_grid
+from tco.parallel import in_ranges
 
 
 def correlate(
@@ -96,7 +95,7 @@ def agree(planes: Tensor, matrices: Tensor, sources: Tensor, inverse: Tensor, lo
     out = torch.empty(b, 2 * d, h, w)
     maps = Maps(_flat(matrices), _ints(sources), _flat(inverse), _flat(log_error))
     shape, flat, result = (h, w, d, sources.shape[1]), _flat(planes), out.numpy().reshape(-1)
-    _in_parallel(lambda *rows: agreement(flat, maps, shape, result, rows), b * h)
+    in_ranges(lambda *rows: agreement(flat, maps, shape, result, rows), b * h)
     return out
 
 
@@ -138,7 +137,7 @@ class _Correlation(torch.autograd.Function):
         seen = f.new_empty(out.shape[:-1])
         run, flat, geometry = forward_kernel(c, groups), _flat(f), _geometry(pairs, matrices, planes)
         o, s = out.numpy().reshape(-1), seen.numpy().reshape(-1)
-        _in_parallel(lambda *rows: run(flat, geometry, layout, o, s, rows), b * h)
+        in_ranges(lambda *rows: run(flat, geometry, layout, o, s, rows), b * h)
         ctx.save_for_backward(f, pairs, matrices, planes)
         ctx.groups, ctx.layout = groups, layout
         ctx.mark_non_differentiable(seen)
@@ -153,7 +152,7 @@ class _Correlation(torch.autograd.Function):
         grads = f.new_zeros((len(pairs), 2, h, w, c))
         run, flat, geometry = backward_kernel(c, ctx.groups), _flat(f), _geometry(pairs, matrices, planes)
         up, into = _flat(upstream[0]), grads.numpy().reshape(-1)
-        _in_parallel(lambda *rows: run(flat, geometry, ctx.layout, up, into, rows), len(pairs))
+        in_ranges(lambda *rows: run(flat, geometry, ctx.layout, up, into, rows), len(pairs))
         total = torch.zeros_like(f)
         total.index_add_(0, pairs.reshape(-1), grads.flatten(0, 1))
         return total, None, None, None, None, None
@@ -182,14 +181,3 @@ def _flat(x: Tensor) -> Any:
 
 def _ints(x: Tensor) -> Any:
     return np.ascontiguousarray(x.numpy().reshape(-1).astype(np.int64))
-
-
-def _in_parallel(task: Callable[[int, int], None], count: int) -> None:
-    """Run a task over ranges of ``count`` items on as many threads as torch may use."""
-    threads = min(torch.get_num_threads(), count)
-    if threads <= 1:
-        task(0, count)
-        return
-    edges = [count * i // threads for i in range(threads + 1)]
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(task, edges[:-1], edges[1:]))

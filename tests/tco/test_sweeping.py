@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tco.backbones.sweeping import Hints, interpolate_points, inverse_range
+from tco.backbones.sweeping import Hints, interpolate_points, inverse_range, nearest_points
 from tco.types import SparseDepth
 
 F64 = torch.float64
@@ -120,3 +120,17 @@ def test_far_from_any_point_the_bumps_are_wide() -> None:
         Hints(near + 0.5, near + 0.5, d).as_volume(lo, step, 10)[0, :, 0, 0, 0].sum() for d in (near, far)
     ]
     assert heights[1] > 2 * heights[0]
+
+
+@pytest.mark.parametrize("count", [1, 6])
+def test_the_nearest_points_are_those_of_all_distances(count: int) -> None:
+    """On the CPU a tree finds them; distances are exact where a point is at the place itself, too."""
+    xy = 28 * torch.rand(60, 2, generator=generator(1))
+    places = torch.cat([28 * torch.rand(200, 2, generator=generator(2)), xy[:5]])
+    distance, index = nearest_points(places, xy, count)
+    each = (places[:, None].double() - xy[None].double()).norm(dim=-1)
+    expected, order = each.sort(1)
+    assert index.shape == distance.shape == (205, count)
+    assert torch.equal(index, order[:, :count])
+    torch.testing.assert_close(distance.double(), expected[:, :count], rtol=1e-6, atol=1e-6)
+    assert distance[-5:, 0].tolist() == [0.0] * 5
