@@ -14,7 +14,7 @@ from torch import Tensor
 from tco.backbones.decoder import SweepConfig
 from tco.backbones.sweep import Encoded, Stage, Sweep
 from tco.backbones.sweeping import BACKGROUND
-from tco.backbones.weights import load_sweep
+from tco.backbones.weights import EMBEDDED, load_sweep
 from training import train
 from training.dataset import load, write
 from training.train import (
@@ -26,6 +26,7 @@ from training.train import (
     losses,
     pooled,
     slope_loss,
+    with_agreed,
     with_sky,
 )
 
@@ -253,3 +254,26 @@ def test_validation_is_of_the_held_out_samples_alone(data: Path, tmp_path: Path)
     with torch.no_grad():
         expected = losses(trainer.mean, sample, [0, 3], 5)[1]
     assert trainer.validate() == pytest.approx(expected)
+
+
+def test_what_views_agree_on_is_told_as_further_points(tmp_path: Path) -> None:
+    """Points come nearer, nothing else changes, and the encoder still learns."""
+    write(tmp_path, 4, 1, (96, 128), 8)
+    sample = load(tmp_path / "000004.npz", 5, (96, 128))
+    assert sample is not None
+    views, priors, _ = sample
+    net = load_sweep(EMBEDDED)
+    for p in net.parameters():
+        p.requires_grad_(True)
+    encoded = net.encode(views, priors, 5)
+    more = with_agreed(net, encoded, views, priors, 3)
+    assert more.volume is encoded.volume and more.volume.requires_grad
+    nearer = encoded.hints[1].distance - more.hints[1].distance
+    assert float(nearer.min()) >= 0 and float((nearer > 0.1).float().mean()) > 0.02
+    assert not any(part.requires_grad for part in (more.hints[0].nearest, more.hints[1].smooth))
+    again, other = (with_agreed(net, encoded, views, priors, seed).hints[0].nearest for seed in (3, 4))
+    assert torch.equal(again, more.hints[0].nearest) and not torch.equal(other, again)
+    told, plain = (losses(net, sample, [0, 3], 5, seed)[0] for seed in (3, None))
+    told.backward()
+    assert told.isfinite() and not torch.equal(told, plain)
+    assert float(net.features.stem[0].conv.weight.grad.abs().max()) > 0
