@@ -56,6 +56,7 @@ _TWO, _THREE = ("--seeds", "2"), ("--seeds", "3")
 
 TABLES = (
     Table("quality", "quality", "quality.md", (*_ALL, "--baselines", "interp", "patchmatch")),
+    Table("marks", "marks", "marks.md"),
     Table("quality-384", "quality", "quality.md",
           ("--baselines", "--steps", "5", "--max_image_size", "384"), "384 pixels"),
     Table("quality-steps", "quality", "quality.md",

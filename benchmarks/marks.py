@@ -1,0 +1,130 @@
+"""What COLMAP's own points reach where the pixels are: the mark that dense maps are measured against.
+
+    python -m benchmarks.marks [--output docs/marks.md]
+
+The share of COLMAP's points that agree with the sensor is a mark for dense maps only where points and pixels
+lie at the same depths. Points are where there is texture; so here the measured pixels of a set are split into
+fifths by their depth, points and maps are compared in each, and the mean over the fifths is what points would
+reach if they were spread over depths as pixels are.
+"""
+
+from __future__ import annotations
+
+import argparse
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.real import SETS, RealSet, arguments, load
+from benchmarks.tables import paragraph, publish, weights_told
+from tco.backbones.weights import EMBEDDED, load_sweep
+from tco.conclusion import concluded
+from tco.optimize import optimize
+from tco.options import TCOConfig
+from tco.types import SparseDepth
+
+FIFTHS = 5
+WITHIN = 0.05
+"""Relative error up to which a depth agrees with the sensor."""
+
+
+class Compared(NamedTuple):
+    """One range of depths: its bounds in metres, and of points and of the maps' pixels there which agree.
+
+    ``nearer`` are the shares of points and pixels that are too near by more than that.
+    """
+
+    low: float
+    high: float
+    points: int
+    agree: tuple[float, float]
+    nearer: tuple[float, float]
+
+
+def at_points(truth: Tensor, sparse: tuple[SparseDepth, ...]) -> tuple[Tensor, Tensor]:
+    """True depth (N,) at the points of all views where it is known, and the points' own relative to it."""
+    true, ratio = [], []
+    for depth, points in zip(truth, sparse, strict=True):
+        x, y = points.xy.floor().long().unbind(1)
+        there = depth[y.clamp(0, depth.shape[0] - 1), x.clamp(0, depth.shape[1] - 1)]
+        known = there > 0
+        true.append(there[known])
+        ratio.append(points.depth[known] / there[known])
+    return torch.cat(true), torch.cat(ratio)
+
+
+def compared(real: RealSet, depth: Tensor) -> list[Compared]:
+    """The fifths of the measured pixels of a set, by their true depth, the nearest first."""
+    assert real.given.sparse is not None
+    known = real.truth > 0
+    pixels, maps = real.truth[known], (depth / real.truth.clamp_min(1e-6))[known]
+    points, ratio = at_points(real.truth, tuple(real.given.sparse))
+    edges = np.quantile(pixels.numpy(), np.linspace(0, 1, FIFTHS + 1))
+    edges[-1] = np.nextafter(edges[-1], np.inf)
+    found = []
+    for low, high in pairwise(edges.tolist()):
+        here = [r[(t >= low) & (t < high)] for t, r in ((points, ratio), (pixels, maps))]
+        agree, nearer = (
+            (float(test(here[0]).float().mean()), float(test(here[1]).float().mean()))
+            for test in (lambda r: (r - 1).abs() < WITHIN, lambda r: r <= 1 - WITHIN)
+        )
+        found.append(Compared(low * real.metres, high * real.metres, len(here[0]), agree, nearer))
+    return found
+
+
+def lines(real: RealSet, depth: Tensor) -> list[str]:
+    """Rows of the table of one set."""
+    assert real.given.sparse is not None
+    ranges = compared(real, depth)
+    _, ratio = at_points(real.truth, tuple(real.given.sparse))
+    every = float(((ratio - 1).abs() < WITHIN).float().mean())
+    spread, maps = np.mean([r.agree for r in ranges], axis=0)
+    rows = [f"| {real.name} | all | {len(ratio)} | {every:.3f} | {spread:.3f} | {maps:.3f} | | |"]
+    for r in ranges:
+        rows.append(
+            f"| | {r.low:.2f} to {r.high:.2f} m | {r.points} | {r.agree[0]:.3f} | | {r.agree[1]:.3f} | "
+            f"{r.nearer[0]:.3f} | {r.nearer[1]:.3f} |"
+        )
+    return rows
+
+
+def parser() -> argparse.ArgumentParser:
+    """Command line."""
+    parser = arguments(__doc__ or "", SETS)
+    parser.set_defaults(size=256, views=0, steps=TCOConfig().steps)
+    return parser
+
+
+def main() -> None:
+    """Measure and publish."""
+    args = parser().parse_args()
+    weights = args.weights or EMBEDDED
+    network, config = load_sweep(weights), TCOConfig(steps=args.steps)
+    rows = [
+        "| set | depths | points | agree | spread as pixels | maps agree | points nearer | maps nearer |",
+        "|" + "---|" * 8,
+    ]
+    for name in args.sets:
+        real = load(name, args.size, args.views)
+        outcome = optimize(network, real.views, real.given, config)
+        depth = concluded(outcome, real.views, real.given, config).agreement.prediction.depth
+        rows += lines(real, depth)
+    told = (
+        f"`python -m benchmarks.marks --sets {' '.join(args.sets)}`: {weights_told(weights)}, "
+        f"{args.size} pixels, {args.views or 'all'} views, {args.steps} steps. agree: share of COLMAP's "
+        "points, each in every view that sees it, within 5 % of the sensor; maps agree: the same of the "
+        "pixels of our maps; by fifths of the measured pixels. spread as pixels: mean of the points' shares "
+        "over the fifths, what they would reach if they lay at the depths that pixels lie at. nearer: share "
+        "that is too near by more than 5 %."
+    )
+    publish(
+        "# The mark: COLMAP's own points\n\n" + paragraph(told) + "\n" + "\n".join(rows) + "\n",
+        args.output, args.part,
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
