@@ -62,11 +62,12 @@ def compared(real: RealSet, depth: Tensor) -> list[Compared]:
     known = real.truth > 0
     pixels, maps = real.truth[known], (depth / real.truth.clamp_min(1e-6))[known]
     points, ratio = at_points(real.truth, tuple(real.given.sparse))
-    edges = np.quantile(pixels.numpy(), np.linspace(0, 1, FIFTHS + 1))
-    edges[-1] = np.nextafter(edges[-1], np.inf)
+    edges = torch.from_numpy(np.quantile(pixels.numpy(), np.linspace(0, 1, FIFTHS + 1))).to(pixels)
     found = []
-    for low, high in pairwise(edges.tolist()):
-        here = [r[(t >= low) & (t < high)] for t, r in ((points, ratio), (pixels, maps))]
+    for k, (low, high) in enumerate(pairwise(edges.tolist())):
+        here = [
+            r[torch.bucketize(t, edges[1:-1], right=True) == k] for t, r in ((points, ratio), (pixels, maps))
+        ]
         agree, nearer = (
             (float(test(here[0]).float().mean()), float(test(here[1]).float().mean()))
             for test in (lambda r: (r - 1).abs() < WITHIN, lambda r: r <= 1 - WITHIN)
@@ -81,7 +82,7 @@ def lines(real: RealSet, depth: Tensor) -> list[str]:
     ranges = compared(real, depth)
     _, ratio = at_points(real.truth, tuple(real.given.sparse))
     every = float(((ratio - 1).abs() < WITHIN).float().mean())
-    spread, maps = np.mean([r.agree for r in ranges], axis=0)
+    spread, maps = np.nanmean([r.agree for r in ranges], axis=0)
     rows = [f"| {real.name} | all | {len(ratio)} | {every:.3f} | {spread:.3f} | {maps:.3f} | | |"]
     for r in ranges:
         rows.append(

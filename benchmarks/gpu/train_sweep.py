@@ -68,14 +68,17 @@ def table(rows: dict[str, Path], files: Sequence[Path], shape: tuple[int, int], 
 
 
 def train(data: Path, run: Path, args: argparse.Namespace) -> None:
-    """Train by the clock, in processes of their own."""
+    """Train by the clock, in processes of their own.
+
+    They are told nothing of what views agree on: for that a CPU takes seconds a sample, and the GPU waits.
+    """
     sizes = args.work / "sizes.json"
     sizes.write_text(json.dumps(SIZES[args.sizes]))
     subprocess.run(
         [
             sys.executable, "-m", "training.train", "--data", str(data), "--out", str(run),
             "--minutes", str(args.minutes), "--sizes", str(sizes), "--workers", str(args.workers),
-            "--device", args.device, "--rate", str(args.rate), "--init", str(args.init),
+            "--device", args.device, "--rate", str(args.rate), "--init", str(args.init), "--told", "0",
         ],
         check=True,
     )  # fmt: skip

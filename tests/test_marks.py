@@ -1,0 +1,60 @@
+"""Points and maps compared at the same depths: shares that are known beforehand."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from benchmarks.marks import FIFTHS, at_points, compared, lines
+from benchmarks.real import RealSet
+from colmap_tco.priors import PriorSet
+from tco.types import Priors, SparseDepth, Views
+
+H, W = 10, 20
+
+
+def real(depth: torch.Tensor, points: SparseDepth) -> RealSet:
+    """One view of this true depth, seen by these points; a unit is half a metre."""
+    views = Views(torch.zeros(1, 3, H, W), torch.ones(1, H, W, dtype=torch.bool), ("a",))
+    priors = PriorSet(Priors(sparse=(points,)), (points[:0],), {})
+    return RealSet("made", views, priors, depth[None], 0.5)
+
+
+@pytest.fixture
+def scene() -> RealSet:
+    """Rows deeper and deeper, from 1 to 10, and a hole; points in the two first rows and in the last."""
+    depth = torch.arange(1.0, H + 1)[:, None].expand(H, W).clone()
+    depth[5, 3] = 0.0
+    xy = torch.tensor([[0.5, 0.5], [19.99, 0.2], [4.5, 1.5], [7.5, 9.9], [3.5, 5.5]])
+    found = torch.tensor([1.02, 0.9, 2.2, 10.0, 3.0])
+    return real(depth, SparseDepth(xy, found, torch.full((5,), 0.01), torch.arange(5)))
+
+
+def test_points_are_compared_with_the_pixel_that_they_are_in(scene: RealSet) -> None:
+    sparse = scene.given.sparse
+    assert sparse is not None
+    true, ratio = at_points(scene.truth, tuple(sparse))
+    assert true.tolist() == [1.0, 1.0, 2.0, 10.0]  # the fifth is where nothing was measured
+    torch.testing.assert_close(ratio, torch.tensor([1.02, 0.9, 1.1, 1.0]))
+
+
+def test_each_range_has_its_own_shares(scene: RealSet) -> None:
+    """The maps are right in the upper half of the rows and a tenth too near below."""
+    maps = scene.truth.clone()
+    maps[:, H // 2 :] *= 0.9
+    ranges = compared(scene, maps)
+    assert len(ranges) == FIFTHS
+    assert (ranges[0].low, ranges[-1].high) == (pytest.approx(0.5), pytest.approx(5.0))
+    assert [r.points for r in ranges] == [3, 0, 0, 0, 1]
+    assert ranges[0].agree == (pytest.approx(1 / 3), 1.0) and ranges[0].nearer == (pytest.approx(1 / 3), 0.0)
+    assert ranges[-1].agree == (1.0, 0.0) and ranges[-1].nearer == (0.0, 1.0)
+    assert sum(r.agree[1] for r in ranges[:2]) == 2.0
+
+
+def test_spread_as_pixels_counts_each_range_alike(scene: RealSet) -> None:
+    """Three of four points are near, where a third agrees: 1 / 2 of all, 2 / 3 of two ranges alike."""
+    first = lines(scene, scene.truth)[0].split("|")
+    assert first[1].strip() == "made" and first[3].strip() == "4"
+    assert float(first[4]) == 0.5
+    assert float(first[5]) == pytest.approx(2 / 3, abs=1e-3)  # of the ranges that have points
+    assert float(first[6]) == 1.0
