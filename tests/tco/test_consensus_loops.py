@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -79,25 +80,35 @@ def test_loops_and_tensor_operations_agree(config: ConsensusConfig) -> None:
     assert float(plain.error.isfinite().double().mean()) > (0.5 if config.consensus_views > 4 else -1)
 
 
+def of_one_place(factors: list[float], dtype: torch.dtype) -> tuple[Wall, Agreement]:
+    """Views from one place, before a wall across, whose depths are off by these factors, alike sure."""
+    scene = wall(len(factors), slope=0.0)
+    cameras = scene.priors.cameras
+    assert cameras is not None
+    depth = scene.depth.to(dtype)[:1] * torch.tensor(factors, dtype=dtype)[:, None, None]
+    same = Cameras(cameras.world_from_cam[:1].repeat(len(factors), 1, 1).to(dtype), cameras.K.to(dtype))
+    prediction = Prediction(depth, torch.full_like(depth, 4.0), same, tuple(range(len(factors))))
+    config = ConsensusConfig(consensus_rounds=1, consensus_width=1e-4)
+    priors = replace(scene.priors, cameras=same)
+    return scene, agreed(prediction, same, scene.views, priors, config)
+
+
 def test_equal_weights_take_the_lower_of_the_middle_two() -> None:
     """Two views whose words are as heavy: whichever is nearer, in both ways of computing."""
-    scene, found = wall(2, slope=0.0), []
-    for dtype in (torch.float32, torch.float64):
-        depth = (
-            scene.depth.to(dtype)[:1].repeat(2, 1, 1) * torch.tensor([1.0, 1.05], dtype=dtype)[:, None, None]
-        )
-        cameras = scene.priors.cameras
-        assert cameras is not None
-        same = Cameras(cameras.world_from_cam[:1].repeat(2, 1, 1).to(dtype), cameras.K.to(dtype))
-        priors = replace(scene.priors, cameras=same)
-        prediction = Prediction(depth, torch.full_like(depth, 4.0), same, (0, 1))
-        config = ConsensusConfig(consensus_rounds=1, consensus_width=1e-4)
-        found.append(agreed(prediction, same, scene.views, priors, config).prediction.depth.double())
     inner = (slice(None), slice(1, -1), slice(1, -1))
-    torch.testing.assert_close(found[0][inner], found[1][inner], rtol=1e-5, atol=0)
-    torch.testing.assert_close(
-        found[0][0][1:-1, 1:-1], scene.depth[0, 1:-1, 1:-1].double(), rtol=1e-5, atol=0
-    )
+    for dtype in (torch.float32, torch.float64):
+        scene, found = of_one_place([1.0, 1.05], dtype)
+        expected = scene.depth[:1].repeat(2, 1, 1).double()
+        torch.testing.assert_close(found.prediction.depth.double()[inner], expected[inner], rtol=1e-5, atol=0)
+
+
+def test_the_spread_of_an_even_number_takes_the_upper_of_the_middle_two() -> None:
+    """Logarithms 0, 1, 3, 7, 11, 14 %: the lower median is 3, distances from it 0, 2, 3, 4, 8, 11."""
+    logs = torch.tensor([0.0, 0.01, 0.03, 0.07, 0.11, 0.14]).double()
+    expected = 1.4826 * 0.04 * math.sqrt(math.pi / 2) * math.sqrt(6) / (6 - 0.8)
+    for dtype in (torch.float32, torch.float64):
+        error = of_one_place(logs.exp().tolist(), dtype)[1].error[2, 5, 5]
+        assert float(error) == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
