@@ -217,7 +217,7 @@ MUTATIONS = [
     ),
     *_of(
         "tco/planar/fit.py",
-        "planar",
+        "planar planar_cost",
         ("np.abs(self.directions @ normal).clip(GRAZING)", "np.ones_like(self.directions @ normal)"),
         ("normal if normal @ like > 0 else -normal", "normal"),
         ("return normal.astype(np.float32), float(normal @ mean)", "return normal.astype(np.float32), 0.0"),
@@ -227,7 +227,7 @@ MUTATIONS = [
     ),
     *_of(
         "tco/planar/label.py",
-        "planar",
+        "planar planar_cost",
         ("apart / (1 + apart)", "apart"),
         ("DOUBT * (plane.error(view, depth) / UNSURE) ** 2", "0 * depth"),
         ("UNLIKE * rarity(", "0 * rarity("),

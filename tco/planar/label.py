@@ -42,11 +42,11 @@ def labelled(view: Shown, planes: Sequence[Plane], config: ConsensusConfig) -> L
         planes: that it may take.
         config: how much depths are trusted, and how much borders cost.
     """
-    colours = _colours(view)
+    colours = colour_bins(view)
     tried, costs, logs = [0], [np.zeros_like(view.depth)], [np.log(view.depth)]
     for k, plane in enumerate(planes):
         depth = plane.depth(view)
-        cost = _cost(view, plane, depth, colours, config)
+        cost = cost_of(view, plane, depth, colours, config)
         if ((cost < WORTH * config.plane_trust) & (cost < NEVER)).mean() >= FEW:
             tried.append(k + 1)
             costs.append(cost)
@@ -59,7 +59,7 @@ def labelled(view: Shown, planes: Sequence[Plane], config: ConsensusConfig) -> L
     return np.asarray(tried)[chosen]
 
 
-def _cost(view: Shown, plane: Plane, depth: Floats, colours: Labels, config: ConsensusConfig) -> Floats:
+def cost_of(view: Shown, plane: Plane, depth: Floats, colours: Labels, config: ConsensusConfig) -> Floats:
     """What it costs (H, W) to take a plane, of these depths, instead of keeping one's own."""
     there = (depth > 0) & view.known
     off = np.where(there, np.log(np.where(there, depth, 1) / view.depth), 0)
@@ -71,7 +71,7 @@ def _cost(view: Shown, plane: Plane, depth: Floats, colours: Labels, config: Con
     return np.where(there, cost.clip(0, NEVER), NEVER).astype(np.float32)
 
 
-def _colours(view: Shown) -> Labels:
+def colour_bins(view: Shown) -> Labels:
     """Bin (H, W) of each pixel's colour, of the picture without its noise."""
     smooth = cv2.GaussianBlur(np.ascontiguousarray(view.image, np.float32), (0, 0), 1.0)
     r, g, b = (np.clip(smooth * BINS, 0, BINS - 1).astype(np.int64)).transpose(2, 0, 1)

@@ -258,3 +258,18 @@ def test_optimisation_starts_from_what_it_was_told(
     still = replace(PLAIN, steps=2, rate=0.0, camera_rate=0.0)
     still = replace(still, polish=replace(still.polish, polish_looks=0))
     assert torch.equal(optimize(network, views, priors, still).prediction.depth, prediction.depth)
+
+
+def test_what_is_told_comes_beside_what_was_given(
+    network: Sweep, encoded: Encoded, rendered: tuple[Views, Priors, Tensor]
+) -> None:
+    """One further point of a view: nowhere is the nearest point further away than it was."""
+    sparse = rendered[1].sparse
+    assert sparse is not None
+    further = SparseDepth(*(getattr(sparse[1], name)[:1] for name in ("xy", "depth", "sigma", "track")))
+    further = replace(further, xy=further.xy * 0 + 0.5)
+    told_of = with_more(network, encoded, sparse, {1: further})
+    before, after = encoded.hints[1].distance, told_of.hints[1].distance
+    assert torch.equal(before[0], after[0])
+    assert float((after[1] - before[1]).max()) <= 0 and float(after[1, 0, 0]) < float(before[1, 0, 0])
+    assert float((after[1] == before[1]).float().mean()) > 0.5

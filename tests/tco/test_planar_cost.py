@@ -1,0 +1,89 @@
+"""What it costs a pixel to take a plane, and planes that are fitted in spite of wrong pixels."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tco.options import ConsensusConfig
+from tco.planar.fit import refit
+from tco.planar.label import MOST_UNLIKE, NEVER, UNLIKE, colour_bins, cost_of
+from tco.planar.view import Floats, Plane, Shown, shown
+from tco.toy import Wall, wall
+from tco.types import Prediction
+
+SLOPE = 0.3
+NORMAL, OFFSET = np.array([-SLOPE, 0, 1]) / math.hypot(SLOPE, 1), 2 / math.hypot(SLOPE, 1)
+CONFIG = ConsensusConfig()
+KNOWN = Plane(NORMAL.astype(np.float32), OFFSET, np.zeros(3), np.eye(3)[:2], np.zeros((3, 3)))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Wall:
+    return wall(6, (96, 128), SLOPE)
+
+
+def seen(scene: Wall, depth: Tensor) -> list[Shown]:
+    """The views with these depths, of confidence 6."""
+    cameras = scene.priors.cameras
+    assert cameras is not None
+    prediction = Prediction(depth, torch.full_like(depth, 6.0), cameras, tuple(range(len(depth))))
+    return [shown(prediction, cameras, scene.views, i) for i in range(len(depth))]
+
+
+def cost(view: Shown) -> Floats:
+    """Of the wall's own plane, which is known exactly."""
+    return cost_of(view, KNOWN, KNOWN.depth(view), colour_bins(view), CONFIG)
+
+
+def plain(view: Shown) -> Shown:
+    """Of one colour."""
+    return replace(view, image=np.full_like(view.image, 0.5))
+
+
+@pytest.mark.parametrize("factor", [1.5, 5.0])
+def test_far_off_a_depth_costs_its_trust_and_no_more(scene: Wall, factor: float) -> None:
+    """However far: one wrong depth cannot outweigh all of its neighbours."""
+    depth = scene.depth.clone()
+    depth[2, 40:44, 50:54] *= factor
+    found = cost(plain(seen(scene, depth)[2]))
+    assert found[41, 51] == pytest.approx(CONFIG.plane_trust, rel=0.2)
+    assert found[41, 51] <= CONFIG.plane_trust
+    assert found[10, 10] < 1e-3
+
+
+def test_a_colour_that_the_plane_does_not_show_costs(scene: Wall) -> None:
+    """Equally far off the plane; one is of the plane's colour and the other of none that is on it."""
+    depth = scene.depth.clone()
+    depth[2, 30:60, 40:80] *= 1.3
+    view = plain(seen(scene, depth)[2])
+    image = view.image.copy()
+    image[30:60, 60:80] = (0.9, 0.1, 0.1)
+    found = cost(replace(view, image=image))
+    assert found[45, 75] - found[45, 50] > 0.5 * UNLIKE * MOST_UNLIKE
+    assert found[45, 75] - found[45, 50] <= UNLIKE * MOST_UNLIKE + 0.1
+
+
+def test_where_there_is_no_depth_the_plane_cannot_be(scene: Wall) -> None:
+    depth = scene.depth.clone()
+    depth[2, 5, 6] = 0.0
+    found = cost(plain(seen(scene, depth)[2]))
+    assert found[5, 6] == np.float32(NEVER) and (found == np.float32(NEVER)).sum() == 1
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3])
+def test_wrong_pixels_of_a_plane_hardly_move_it(scene: Wall, share: float) -> None:
+    """Some of the pixels that took it are 40 % too deep; it stays within half a per cent of the wall."""
+    depth = scene.depth.clone()
+    wrong = torch.rand(depth.shape, generator=torch.Generator().manual_seed(3)) < share
+    depth[wrong] *= 1.4
+    views = seen(scene, depth)
+    labels = [np.ones(view.depth.shape, np.int64) for view in views]
+    (plane,) = refit(views, labels, [KNOWN], CONFIG)
+    truth = seen(scene, scene.depth)[2]
+    assert np.abs(plane.depth(truth) / truth.depth - 1).max() < 0.005
