@@ -243,9 +243,8 @@ MUTATIONS = [
     ),
     *_of(
         "tco/planar/run.py",
-        "planar",
+        "planar planar_cost",
         ("label[(label == k + 1) & ~on] = 0", "pass"),
-        ("zip(views.wanted, results, strict=True)", "zip(range(count), results, strict=False)"),
         ("if agreement.prediction is prediction:", "if False:"),
     ),
     *_of(

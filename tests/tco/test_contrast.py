@@ -132,3 +132,17 @@ def test_the_network_sees_equalised_pictures(rendered: tuple[Views, Priors, Tens
         before = plain.encode(views, priors)
     assert torch.equal(found.volume, expected.volume) and torch.equal(found.fine, expected.fine)
     assert not torch.allclose(found.fine, before.fine, atol=1e-3)
+
+
+def test_what_shows_nothing_takes_part_as_the_mean_of_what_does() -> None:
+    """Whatever is in a masked half, the other half comes out as if the mean of it were there."""
+    images = noise(0.1, level=0.6).clone()
+    valid = everywhere(images)
+    valid[..., 70:] = False
+    filled = images.clone()
+    filled[..., 70:] = brightness(images)[valid].mean()
+    expected = equalised(filled, everywhere(filled), 10.0)[..., :70]
+    images[..., 70:] = torch.rand(1, 3, 96, 58, generator=torch.Generator().manual_seed(1))
+    found = equalised(images, valid, 10.0)
+    torch.testing.assert_close(found[..., :70], expected, rtol=0, atol=2e-4)
+    assert torch.equal(found[..., 70:], images[..., 70:])

@@ -10,7 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from tco.consensus import Agreement
 from tco.options import ConsensusConfig
+from tco.planar import run
 from tco.planar.fit import refit
 from tco.planar.label import MOST_UNLIKE, NEVER, UNLIKE, colour_bins, cost_of
 from tco.planar.view import Floats, Plane, Shown, shown
@@ -87,3 +89,21 @@ def test_wrong_pixels_of_a_plane_hardly_move_it(scene: Wall, share: float) -> No
     (plane,) = refit(views, labels, [KNOWN], CONFIG)
     truth = seen(scene, scene.depth)[2]
     assert np.abs(plane.depth(truth) / truth.depth - 1).max() < 0.005
+
+
+def test_a_label_whose_plane_is_behind_the_camera_is_none(
+    scene: Wall, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Labels of larger pictures are those of coarser ones, where a plane may still be in front."""
+    everywhere_one = np.ones(tuple(scene.depth.shape[1:]), np.int64)
+    monkeypatch.setattr(run, "labelled", lambda *_args, **_kw: everywhere_one.copy())
+    behind = replace(KNOWN, offset=-OFFSET)
+    monkeypatch.setattr(run, "find", lambda *_args: [behind])
+    monkeypatch.setattr(run, "refit", lambda *_args: [behind])
+    cameras = scene.priors.cameras
+    assert cameras is not None
+    prediction = Prediction(scene.depth, torch.full_like(scene.depth, 6.0), cameras, tuple(range(6)))
+    agreement = Agreement(prediction, torch.full_like(scene.depth, 0.01))
+    found = run.flattened(agreement, cameras, scene.views, CONFIG)
+    assert int(found.labels.abs().max()) == 0
+    assert torch.equal(found.agreement.prediction.depth, scene.depth)
