@@ -66,8 +66,7 @@ def told(
     if rounds and backbone.with_points(encoded, {0: given[0]}) is encoded:
         return encoded, prediction, points
     for _ in range(rounds):
-        agreement = together(prediction, prediction.cameras, views, priors, config.consensus, seed).agreement
-        found = agreed_points(agreement, views, given, config, seed)
+        found = further_points(prediction, views, priors, config, seed)
         if not found:
             break
         points = found
@@ -78,6 +77,23 @@ def told(
         else:
             prediction = backbone.decode(now)
     return now, prediction, points
+
+
+def further_points(
+    prediction: Prediction, views: Views, priors: Priors, config: TCOConfig, seed: int = 0
+) -> dict[int, SparseDepth]:
+    """What the views agree on, by consensus and planes, as points; see :func:`agreed_points`.
+
+    Args:
+        prediction: of all views, each by itself.
+        views: of which the wanted ones get points.
+        priors: with overlap and the points that these keep their distance from.
+        config: settings; ``hints`` and ``consensus`` of them.
+        seed: of the planes and of the pixels that are drawn.
+    """
+    assert priors.sparse is not None
+    agreement = together(prediction, prediction.cameras, views, priors, config.consensus, seed).agreement
+    return agreed_points(agreement, views, priors.sparse, config, seed)
 
 
 def with_more(

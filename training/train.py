@@ -23,9 +23,8 @@ from torch import Tensor
 from tco.backbones.decoder import SweepConfig
 from tco.backbones.sweep import Encoded, Stage, Sweep
 from tco.backbones.sweeping import BACKGROUND
-from tco.hints import agreed_points, with_more
+from tco.hints import further_points, with_more
 from tco.options import TCOConfig
-from tco.planar.run import together
 from tco.types import Priors, Views
 from training.dataset import load
 from training.loop import Loop, LoopConfig, arguments, launch
@@ -121,12 +120,11 @@ def slope_loss(stage: Stage, truth: Tensor, floor: Tensor) -> Tensor:
 
 @torch.no_grad()
 def with_agreed(net: Sweep, encoded: Encoded, views: Views, priors: Priors, seed: int) -> Encoded:
-    """The features with what all views agree on as further points, as in a run."""
+    """The features with what all views agree on as further points, as in a run of eight views or more."""
     assert priors.sparse is not None
-    config, first = TCOConfig(), net.decode(encoded)
-    agreement = together(first, first.cameras, views, priors, config.consensus, seed).agreement
-    more = agreed_points(agreement, views, priors.sparse, config, seed)
-    return replace(encoded, hints=with_more(net, encoded, priors.sparse, more).hints)
+    more = further_points(net.decode(encoded), views, priors, TCOConfig(), seed)
+    told: Encoded = with_more(net, encoded, priors.sparse, more)
+    return told
 
 
 def losses(
@@ -250,8 +248,9 @@ def main() -> None:
     parser.add_argument("--told", type=float, default=TrainConfig.told, help="of what views agree on")
     parser.add_argument("--workers", type=int, default=2, help="processes that share each step")
     args = parser.parse_args()
-    config = TrainConfig(steps=args.steps, rate=args.rate, minutes=args.minutes, share=args.share)
-    config = replace(config, told=args.told)
+    config = TrainConfig(
+        steps=args.steps, rate=args.rate, minutes=args.minutes, share=args.share, told=args.told
+    )
     if args.sizes is not None:
         config = replace(config, sizes=tuple(tuple(s) for s in json.loads(args.sizes.read_text())))
     launch(partial(trainer, config, args.data, args.out, args.device), args, args.workers)
