@@ -255,6 +255,7 @@ def arguments(description: str, plain: LoopConfig) -> argparse.ArgumentParser:
     parser.add_argument("--rate", type=float, default=plain.rate)
     parser.add_argument("--minutes", type=float, default=plain.minutes)
     parser.add_argument("--sizes", type=Path, help="JSON of the configuration's sizes")
+    parser.add_argument("--seed", type=int, default=plain.seed, help="of what is drawn")
     parser.add_argument("--threads", type=int, default=1, help="of each process")
     parser.add_argument("--device", default="cpu", help="cuda: several workers keep one GPU busy")
     parser.add_argument("--init", type=Path, help="weights to start from")

@@ -249,7 +249,12 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2, help="processes that share each step")
     args = parser.parse_args()
     config = TrainConfig(
-        steps=args.steps, rate=args.rate, minutes=args.minutes, share=args.share, told=args.told
+        steps=args.steps,
+        rate=args.rate,
+        minutes=args.minutes,
+        share=args.share,
+        told=args.told,
+        seed=args.seed,
     )
     if args.sizes is not None:
         config = replace(config, sizes=tuple(tuple(s) for s in json.loads(args.sizes.read_text())))

@@ -129,7 +129,13 @@ def main() -> None:
     parser.add_argument("--pixels", type=int, default=plain.pixels, help="of all pictures of a batch")
     args = parser.parse_args()
     config = replace(
-        plain, steps=args.steps, rate=args.rate, minutes=args.minutes, stop=args.stop, pixels=args.pixels
+        plain,
+        steps=args.steps,
+        rate=args.rate,
+        minutes=args.minutes,
+        stop=args.stop,
+        pixels=args.pixels,
+        seed=args.seed,
     )
     if args.sizes is not None:
         sizes = tuple(tuple(s) for s in json.loads(args.sizes.read_text()))
