@@ -9,9 +9,10 @@ features of the source views and by the depths that the other views predict.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
+from typing import TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -23,7 +24,10 @@ from tco.backbones.layers import FeatureNet
 from tco.backbones.sweeping import BACKGROUND, Hints, interpolate_points, inverse_range, relative_cameras
 from tco.backbones.transformer import compute_dtype, computing
 from tco.backbones.warp import agree, correlate
+from tco.parallel import side_by_side
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
+
+_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True)
@@ -138,22 +142,34 @@ class Sweep(nn.Module):
         if len(views) < 2:
             raise ValueError("a plane sweep needs at least two views")
         images = equalised(views.images, views.valid, self.config.equalise)
-        with self.mixed(images.device):
-            coarse, fine, context = self.features(images, views.valid)
+        coarse, fine, context = self._features(images, views.valid)
         lo, hi = inverse_range(priors.sparse, views.images)
         step = (hi - lo) / (self.config.planes - 1)
         order = torch.argsort(priors.overlap, dim=1, descending=True, stable=True)
         sources = order[:, : min(max_sources, len(views) - 1)]
         index = torch.arange(self.config.planes, device=lo.device, dtype=lo.dtype)
         planes = (lo[:, None] + step[:, None] * index)[..., None, None]
-        volume = torch.cat(
-            [
-                self._volume(coarse, priors.cameras, block, sources[block], planes[block])
-                for block in _blocks(range(len(views)), coarse[0, 0].numel() * self.config.planes)
-            ]
+        every, cameras = range(len(views)), priors.cameras
+        parts = _in_blocks(
+            lambda b: self._volume(coarse, cameras, every[b], sources[b], planes[b]),
+            len(views),
+            coarse[0, 0].numel() * self.config.planes,
+            coarse.device,
         )
         quarter, half = (interpolate_points(priors.sparse, views.size, s, views.images) for s in (4, 2))
-        return Encoded(volume, fine, context, lo, step, sources, priors.cameras, (quarter, half))
+        return Encoded(torch.cat(parts), fine, context, lo, step, sources, cameras, (quarter, half))
+
+    def _features(self, images: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+        """Of all views (V, 3, H, W): those of the coarse and of the fine sweep, and context."""
+
+        def some(block: slice) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+            with self.mixed(images.device):
+                found: tuple[Tensor, Tensor, tuple[Tensor, ...]] = self.features(images[block], valid[block])
+            return found
+
+        parts = _in_blocks(some, len(images), 2 * images[0, 0].numel(), images.device)
+        coarse, fine, context = zip(*parts, strict=True)
+        return torch.cat(coarse), torch.cat(fine), tuple(map(torch.cat, zip(*context, strict=True)))
 
     def with_points(self, encoded: Encoded, points: Mapping[int, SparseDepth]) -> Encoded:
         """The same features with other sparse points as hints of some views."""
@@ -230,8 +246,8 @@ class Sweep(nn.Module):
 
     def coarse(self, encoded: Encoded, views: Sequence[int]) -> Stage:
         """First stage of some views, at 1/4 of the resolution."""
-        blocks = _blocks(views, encoded.volume[0, ..., 0].numel())
-        parts = [self._scores(encoded, block) for block in blocks]
+        cells, device = encoded.volume[0, ..., 0].numel(), encoded.volume.device
+        parts = _in_blocks(lambda b: self._scores(encoded, views[b]), len(views), cells, device)
         scores = torch.cat(parts)
         v = torch.as_tensor(list(views), device=encoded.lo.device)
         lo, step = encoded.lo[v].view(-1, 1, 1), encoded.step[v].view(-1, 1, 1)
@@ -256,13 +272,12 @@ class Sweep(nn.Module):
         """Pass ``k`` of the refinement of some views, given half-resolution depths of all views."""
         if stage.inverse.shape[-1] != encoded.fine.shape[-1]:
             stage = stage.doubled()
-        blocks = _blocks(views, encoded.fine[0, 0].numel() * self.config.hypotheses)
-        done = 0
-        parts = []
-        for block in blocks:
-            parts.append(self._refined(k, encoded, block, stage[done : done + len(block)], world))
-            done += len(block)
-        return joined(parts)
+
+        def some(block: slice) -> Stage:
+            return self._refined(k, encoded, views[block], stage[block], world)
+
+        cells = encoded.fine[0, 0].numel() * self.config.hypotheses
+        return joined(_in_blocks(some, len(views), cells, encoded.fine.device))
 
     def _refined(self, k: int, encoded: Encoded, views: Sequence[int], stage: Stage, world: Stage) -> Stage:
         """One pass for a few views."""
@@ -310,8 +325,9 @@ class Sweep(nn.Module):
         return (total / (weights + 1e-6)).permute(0, 3, 1, 2)
 
 
-BATCH = 400_000
-"""Cells of correlation volumes that are computed at once: small views together, large ones alone."""
+BATCH, LARGE_BATCH = 200_000, 400_000
+"""Cells of correlation volumes that are computed at once, on a CPU, where several such are at work side by
+side, and elsewhere: small views together, large ones alone."""
 
 ERROR_UNIT = 0.02
 """A relative error of this size has confidence 2, so its surfel is half opaque."""
@@ -322,10 +338,12 @@ def expected_confidence(log_error: Tensor) -> Tensor:
     return 1 + ERROR_UNIT * (-log_error).exp()
 
 
-def _blocks(views: Sequence[int], cells: int) -> Iterator[Sequence[int]]:
-    """The views in groups of at most ``BATCH`` cells, at least one view each."""
-    per = max(1, BATCH // cells)
-    return (views[k : k + per] for k in range(0, len(views), per))
+def _in_blocks(
+    task: Callable[[slice], _Result], views: int, cells: int, device: torch.device
+) -> list[_Result]:
+    """Results of a task of so many views in groups, of so many cells each; at least one view a group."""
+    per = max(1, (BATCH if device.type == "cpu" else LARGE_BATCH) // cells)
+    return side_by_side(task, [slice(k, min(k + per, views)) for k in range(0, views, per)], device)
 
 
 def _world(context: Prediction) -> Stage:
