@@ -15,7 +15,7 @@ from tco.objective import NothingVisibleError, ObjectiveConfig, geometric, photo
 from tco.options import TCOConfig
 from tco.surfels import Adjustment, SurfelConfig, Surfels, from_depth
 from tco.types import Cameras, HeldCameras, Prediction, Priors, SparseDepth, Views
-from tco.warping import warp, warped_photometric
+from tco.warped import warped_difference
 
 logger = logging.getLogger(__name__)
 
@@ -194,9 +194,10 @@ class Terms:
         if "geometric" in weights:
             terms["geometric"] = geometric(surfels, cameras[targets], *there)
         if "warped" in weights:
-            warped = warp(depth, self.views, cameras, source, targets, context)
-            image, opacity = self.views.images[source], self._opacity(source, prediction)
-            terms["warped"] = warped_photometric(warped, image, opacity, self.objective)
+            opacity = self._opacity(source, prediction).detach()
+            terms["warped"] = warped_difference(
+                depth, opacity, self.views, cameras, (source, targets), context, self.objective
+            )
         return terms
 
     def _opacity(self, source: int, prediction: Prediction) -> Tensor:
