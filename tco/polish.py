@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from tco.adam import Adam
 from tco.geometry import pixel_grid
 from tco.options import TCOConfig
+from tco.parallel import side_by_side
 from tco.schedule import Sources, draw_targets
 from tco.terms import COMPATIBILITY, Terms, errors_at, means
 from tco.types import Cameras, Prediction, Priors, SparseDepth
@@ -153,7 +154,9 @@ class _Polishing:
         if seen:
             with torch.no_grad():
                 self.now.depth[seen] = self.refined(seen).depth
-        return means([self.of_source(*pair) for pair in pairs])
+        if self.terms.extra:  # which need not allow that two are computed at once
+            return means([self.of_source(*pair) for pair in pairs])
+        return means(side_by_side(lambda pair: self.of_source(*pair), pairs, self.prediction.depth.device))
 
     def targets(self, source: int) -> list[int]:
         """Views that a source is compared with."""
@@ -162,7 +165,7 @@ class _Polishing:
         return draw_targets(self.terms.overlap, source, self.config.targets, self.generator)
 
     def of_source(self, source: int, targets: Sequence[int]) -> dict[str, Tensor]:
-        """Terms of one source; one after the other, so that only one comparison is in memory."""
+        """Terms of one source, whose gradients are added to the field's."""
         change = self.field([source])
         mine = self.refined([source], change)
         part = self.terms.of_source(source, targets, mine, self.now, self.cameras, self.weights)
