@@ -172,20 +172,18 @@ def _asked_in_loops(
     from tco._consensus_kernels import Asked, Rules, ask
 
     h, w = evidence.shape[1:3]
-    ray = rays(pixel_grid(h, w, evidence).reshape(-1, 2), cameras.K[view]).contiguous().numpy()
-    other_from_view = invert(cameras.world_from_cam[others]) @ cameras.world_from_cam[view]
-    K, poses = cameras.K[others].double(), other_from_view[:, :3].double().contiguous()
-    intrinsics = torch.stack([K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2]], 1)
-    asked = Asked(evidence.numpy(), np.array(others), poses.numpy(), intrinsics.numpy())
-    reach = config.consensus_reach
+    ray = rays(pixel_grid(h, w, evidence).reshape(-1, 2), cameras.K[view])[:, :2].T.reshape(2, h, w)
+    other_from_view = invert(cameras.world_from_cam[others].double()) @ cameras.world_from_cam[view].double()
+    poses = (cameras.K[others].double() @ other_from_view[:, :3]).float().numpy()
+    asked, reach = Asked(evidence.numpy(), np.array(others), poses), config.consensus_reach
     rules = Rules(
         config.consensus_rounds, math.exp(-reach), math.exp(reach), config.consensus_width, ALL, HALF, FEWEST,
         SIGMA_OF_MAD * OF_MEDIAN,
     )  # fmt: skip
-    own, out = evidence[view].reshape(-1, 3).numpy(), evidence.new_empty(2, h * w)
-    into = out.numpy()
-    in_ranges(lambda *pixels: ask(own, ray, asked, rules, pixels, into), h * w)
-    depth, error = out.reshape(2, h, w)
+    own, out = evidence[view].movedim(-1, 0)[:2].contiguous().numpy(), evidence.new_empty(2, h, w)
+    places, into = ray.contiguous().numpy(), out.numpy()
+    in_ranges(lambda *rows: ask(own, places, asked, rules, rows, into), h)
+    depth, error = out
     return depth, error
 
 

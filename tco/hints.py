@@ -13,16 +13,17 @@ They are input alone: no penalty holds depths to them, since they are the networ
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from tco.backbones.base import Backbone
+from tco.backbones.base import Backbone, Drafts
 from tco.consensus import Agreement
-from tco.context import merged
 from tco.options import TCOConfig
 from tco.planar.run import together
 from tco.polish import displacement
@@ -55,28 +56,32 @@ def told(
         Where the network takes no points, views are few, cameras are uncertain, or no view has any pixel that
         is agreed on: ``encoded`` itself, what the network says at first, and none.
     """
-    prediction, points = backbone.decode(encoded), dict[int, SparseDepth]()
-    if priors.cameras is None or priors.sparse is None or priors.overlap is None:
-        return encoded, prediction, points
-    uncertain = displacement(priors, views.size) > config.consensus.consensus_uncertainty
-    if not backbone.uses_cameras or len(views) < FEWEST_VIEWS or uncertain:
-        return encoded, prediction, points
-    given, now = priors.sparse, encoded
-    rounds = config.hints.hint_rounds
-    if rounds and backbone.with_points(encoded, {0: given[0]}) is encoded:
-        return encoded, prediction, points
+    points, now, prediction = dict[int, SparseDepth](), encoded, None
+    rounds = config.hints.hint_rounds if _can_be_told(backbone, encoded, views, priors, config) else 0
     for _ in range(rounds):
-        found = further_points(prediction, views, priors, config, seed)
+        said = prediction or _first_word(backbone, encoded)
+        found = further_points(said, views, priors, config, seed)
         if not found:
             break
-        points = found
-        now = with_more(backbone, encoded, given, points)
-        if views.helpers:
-            part = backbone.decode(now, list(views.wanted), prediction)
-            prediction = merged(prediction, part)
-        else:
-            prediction = backbone.decode(now)
-    return now, prediction, points
+        assert priors.sparse is not None
+        points, now = found, with_more(backbone, encoded, priors.sparse, found)
+        prediction = backbone.decode(now)
+    return now, prediction or backbone.decode(now), points
+
+
+def _can_be_told(backbone: Backbone, encoded: Any, views: Views, priors: Priors, config: TCOConfig) -> bool:
+    """Whether there are views to ask, cameras that are known well, and a network that takes points."""
+    if priors.cameras is None or priors.sparse is None or priors.overlap is None:
+        return False
+    uncertain = displacement(priors, views.size) > config.consensus.consensus_uncertainty
+    if not backbone.uses_cameras or len(views) < FEWEST_VIEWS or uncertain:
+        return False
+    return backbone.with_points(encoded, {0: priors.sparse[0]}) is not encoded
+
+
+def _first_word(backbone: Backbone, encoded: Any) -> Prediction:
+    """What the network says at first, at a part of the resolution if it can: it is not what is returned."""
+    return backbone.draft(encoded) if isinstance(backbone, Drafts) else backbone.decode(encoded)
 
 
 def further_points(
@@ -85,15 +90,35 @@ def further_points(
     """What the views agree on, by consensus and planes, as points; see :func:`agreed_points`.
 
     Args:
-        prediction: of all views, each by itself.
+        prediction: of all views, each by itself, perhaps at a part of the resolution.
         views: of which the wanted ones get points.
         priors: with overlap and the points that these keep their distance from.
         config: settings; ``hints`` and ``consensus`` of them.
         seed: of the planes and of the pixels that are drawn.
     """
     assert priors.sparse is not None
-    agreement = together(prediction, prediction.cameras, views, priors, config.consensus, seed).agreement
-    return agreed_points(agreement, views, priors.sparse, config, seed)
+    factor = views.size[0] // prediction.depth.shape[-2]
+    if factor > 1:
+        views, priors = (
+            reduced(views, factor),
+            replace(
+                priors, cameras=prediction.cameras, sparse=tuple(scaled(s, 1 / factor) for s in priors.sparse)
+            ),
+        )
+    flat = together(prediction, prediction.cameras, views, priors, config.consensus, seed)
+    found = agreed_points(flat.agreement, views, priors.sparse or (), config, seed)
+    return {i: scaled(points, factor) for i, points in found.items()}
+
+
+def reduced(views: Views, factor: int) -> Views:
+    """The views at a part of the resolution; of pixels that are valid alone."""
+    invalid = F.max_pool2d((~views.valid).to(views.images).unsqueeze(1), factor).squeeze(1)
+    return replace(views, images=F.avg_pool2d(views.images, factor), valid=invalid == 0)
+
+
+def scaled(points: SparseDepth, factor: float) -> SparseDepth:
+    """The same points in pixels of another size."""
+    return replace(points, xy=points.xy * factor)
 
 
 def with_more(

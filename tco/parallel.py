@@ -8,8 +8,8 @@ from typing import TypeVar
 
 import torch
 
-WORKERS = 4
-"""Tasks of tensor operations at once, at most: each has its own intermediate results in memory."""
+WORKERS = 2
+"""Tasks of tensor operations at once, at most: each has intermediate results of its own in memory."""
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")

@@ -64,3 +64,15 @@ class RunsAhead(Protocol):
             changed: dotted names of the layers of :meth:`Backbone.decoder` that change.
         """
         ...
+
+
+@runtime_checkable
+class Drafts(Protocol):
+    """A backbone that can say what it sees at a part of the resolution, for a part of the time."""
+
+    def draft(self, encoded: Any) -> Prediction:
+        """Depths and confidences of all views, and the cameras of maps of that size.
+
+        Height and width are those of the canvas divided by one whole number.
+        """
+        ...
