@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.real import arguments, load
+from benchmarks.real import SIZE, arguments, load
 from benchmarks.tables import paragraph, plot_beside, publish, weights_told
 from tco.backbones.sweep import ERROR_UNIT
 from tco.backbones.weights import EMBEDDED, load_sweep
@@ -80,7 +80,7 @@ def plot(curves: dict[str, list[Row]], path: Path) -> None:
 def parser() -> argparse.ArgumentParser:
     """Command line."""
     parser = arguments(__doc__ or "")
-    parser.set_defaults(steps=TCOConfig().steps, size=256, views=0)
+    parser.set_defaults(steps=TCOConfig().steps, size=SIZE, views=0)
     return parser
 
 

@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 
-from benchmarks.real import SETS, RealSet, arguments, load, median_error, within
+from benchmarks.real import SETS, SIZE, RealSet, arguments, load, median_error, within
 from benchmarks.rendered import SCENES
 from benchmarks.tables import paragraph, publish, weights_told
 from tco.backbones.weights import EMBEDDED, load_sweep
@@ -50,7 +50,7 @@ def cell(real: RealSet, outcome: Outcome, config: ConsensusConfig) -> str:
 def parser() -> argparse.ArgumentParser:
     """Command line."""
     parser = arguments(__doc__ or "", (*SETS, *SCENES))
-    parser.set_defaults(size=256, views=0, steps=TCOConfig().steps)
+    parser.set_defaults(size=SIZE, views=0, steps=TCOConfig().steps)
     return parser
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from torch import Tensor
 
 from benchmarks.planes import FIRST_SEED, random_scene
-from benchmarks.real import SETS, arguments, load
+from benchmarks.real import SETS, SIZE, arguments, load
 from benchmarks.rendered import SCENES
 from benchmarks.tables import paragraph, publish, weights_told
 from tco.backbones.sweep import Sweep
@@ -83,7 +83,7 @@ def rows(networks: tuple[Sweep, Sweep], case: Case) -> Iterator[tuple[str, Share
 def parser() -> argparse.ArgumentParser:
     """Command line."""
     parser = arguments(__doc__ or "", (*SETS, *SCENES))
-    parser.set_defaults(size=256, views=0, steps=TCOConfig().steps)
+    parser.set_defaults(size=SIZE, views=0, steps=TCOConfig().steps)
     parser.add_argument("--random", type=int, default=8, help="random scenes, besides")
     return parser
 

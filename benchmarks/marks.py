@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.real import SETS, RealSet, arguments, load
+from benchmarks.real import SETS, SIZE, RealSet, arguments, load
 from benchmarks.tables import paragraph, publish, weights_told
 from tco.backbones.weights import EMBEDDED, load_sweep
 from tco.conclusion import concluded
@@ -95,7 +95,7 @@ def lines(real: RealSet, depth: Tensor) -> list[str]:
 def parser() -> argparse.ArgumentParser:
     """Command line."""
     parser = arguments(__doc__ or "", SETS)
-    parser.set_defaults(size=256, views=0, steps=TCOConfig().steps)
+    parser.set_defaults(size=SIZE, views=0, steps=TCOConfig().steps)
     return parser
 
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from torch import Tensor
 
-from benchmarks.real import SETS, arguments, load
+from benchmarks.real import SETS, SIZE, arguments, load
 from benchmarks.rendered import SCENES
 from benchmarks.tables import paragraph, publish, weights_told
 from tco.backbones.weights import EMBEDDED, load_sweep
@@ -100,7 +100,7 @@ def shares(case: Case, config: ConsensusConfig) -> tuple[float, float, float]:
 def parser() -> argparse.ArgumentParser:
     """Command line."""
     parser = arguments(__doc__ or "", (*SETS, *SCENES))
-    parser.set_defaults(size=256, views=0, steps=TCOConfig().steps)
+    parser.set_defaults(size=SIZE, views=0, steps=TCOConfig().steps)
     parser.add_argument("--random", type=int, default=16, help="random scenes, besides")
     return parser
 

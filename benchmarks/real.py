@@ -20,6 +20,7 @@ from torch import Tensor
 from benchmarks.rendered import SCENES, made
 from benchmarks.tables import to_file
 from colmap_tco.priors import PriorSet, build_priors, chunk_frame
+from colmap_tco.published import NETWORKS
 from colmap_tco.tracks import read_tracks
 from colmap_tco.views import ViewConfig, batch, make_views, original_from_network
 from colmap_tco.workspace import open_workspace
@@ -27,6 +28,8 @@ from tco.types import Prediction, Priors, Views
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 SETS = ("kitchen", "office", "livingroom")
+SIZE = NETWORKS["sweep"].image_size
+"""Longer side, pixels, of the pictures that densify gives the embedded network by itself."""
 RENDERED = Path("runs/rendered")
 """Where rendered scenes are, or are made."""
 

@@ -62,7 +62,8 @@ class Network:
         kind: whose weights it takes, as :func:`tco.backbones.identify.identify` tells.
         checkpoint: where its weights are published; None if they are in the package, or not made yet.
         training: how weights are made of which there are none yet; empty for all others.
-        image_size: longer side of the images that it was trained with, pixels.
+        image_size: longer side of the images that it is given unless the user says otherwise, pixels: as it
+            was trained, and a little more for sweep, which gains by it (``docs/quality.md``).
         stride: sides of images are multiples of this.
         tco: settings of :class:`tco.options.TCOConfig` that suit this network, for those which the user
             left at their defaults.
@@ -125,7 +126,7 @@ NETWORKS: dict[str, Network] = {
             loader="tco.backbones.weights:load_sweep",
             kind="sweep",
             checkpoint=None,
-            image_size=256,
+            image_size=320,
             stride=16,
             most_views=128,
         ),

@@ -45,7 +45,7 @@ class ViewConfig:
     max_image_size: int = knob(
         0,
         "longer side of the images that the network sees, pixels; memory and time grow with its square. 0: "
-        "what the network was trained with, 256 for sweep, 518 for vggt and pi3, 504 for da3",
+        "what suits the network, 320 for sweep, 518 for vggt and pi3, 504 for da3",
     )
     mask_path: str = knob(
         "",
@@ -107,7 +107,7 @@ class ChunkFrame:
 
 
 def make_views(
-    workspace: Workspace, config: ViewConfig, stride: int, usual_size: int = 256
+    workspace: Workspace, config: ViewConfig, stride: int, usual_size: int = 320
 ) -> tuple[list[View], dict[str, str]]:
     """The usable images of a workspace as views, ordered by name, and name → reason for the others.
 

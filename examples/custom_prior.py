@@ -70,7 +70,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("workspace", type=Path)
     parser.add_argument("--plane", help="a,b,c,d of a X + b Y + c Z + d = 0 in COLMAP's frame")
-    parser.add_argument("--size", type=int, default=256)
+    parser.add_argument("--size", type=int, default=320)
     parser.add_argument("--steps", type=int, default=10)
     args = parser.parse_args()
     scene = open_scene(args.workspace, ViewConfig(max_image_size=args.size))

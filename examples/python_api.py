@@ -76,7 +76,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("workspace", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=Path("cloud.ply"))
-    parser.add_argument("--size", type=int, default=256)
+    parser.add_argument("--size", type=int, default=320)
     parser.add_argument("--steps", type=int, default=10)
     args = parser.parse_args()
     cloud, _, errors = reconstruct(args.workspace, args.size, TCOConfig(steps=args.steps))

@@ -86,7 +86,7 @@ def main() -> None:
     parser.add_argument("workspace", type=Path)
     parser.add_argument("depths", type=Path)
     parser.add_argument("--unit", type=float, default=0.001, help="metres of one step of the PNG files")
-    parser.add_argument("--size", type=int, default=256)
+    parser.add_argument("--size", type=int, default=320)
     parser.add_argument("--steps", type=int, default=10)
     args = parser.parse_args()
     scene = open_scene(args.workspace, ViewConfig(max_image_size=args.size))

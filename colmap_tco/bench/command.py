@@ -59,7 +59,7 @@ class BenchConfig:
     image_width: int = knob(
         0,
         "width of the pictures that the network sees, pixels; 0: as published, 504 for scannet and 518 for "
-        "the others, and 256 for sweep",
+        "the others, and 320 for sweep",
     )
     published_settings: bool = knob(
         True,

@@ -7,12 +7,14 @@ from typing import Any
 
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from tco.backbones.sweep import Encoded, Sweep
 from tco.backbones.weights import load_sweep
 from tco.consensus import Agreement
-from tco.hints import LEAST, UNTRACKED, agreed_points, joined, told, with_more
+from tco.geometry import project
+from tco.hints import LEAST, UNTRACKED, agreed_points, further_points, joined, reduced, told, with_more
 from tco.optimize import optimize
 from tco.options import ConsensusConfig, HintsConfig, TCOConfig
 from tco.toy import Toy, Wall, wall
@@ -150,7 +152,7 @@ def test_the_network_is_told_of_what_is_right(network: Sweep, rendered: tuple[Vi
         start = network.encode(views, few)
     now, second, points = told(network, start, views, few, PLAIN)
     assert sum(map(len, points.values())) > 200
-    pairs = [(p.depth, truth[i][pixels(p)]) for i, p in points.items()]
+    pairs = [(p.depth, truth[i][p.xy[:, 1].long(), p.xy[:, 0].long()]) for i, p in points.items()]
     depth, true = (torch.cat(part) for part in zip(*pairs, strict=True))
     error = (depth / true - 1).abs()[true > 0]
     assert float((error < 0.02).float().mean()) > 0.8
@@ -234,16 +236,61 @@ def test_a_round_that_finds_nothing_keeps_what_the_one_before_found(
 
 
 @pytest.mark.usefixtures("few_views")
-def test_helpers_stay_as_the_network_said_first(
+def test_helpers_are_not_told_of(
     network: Sweep, encoded: Encoded, rendered: tuple[Views, Priors, Tensor]
 ) -> None:
     views, priors, _ = rendered
-    _, prediction, points = told(network, encoded, replace(views, helpers=2), priors, PLAIN)
-    with torch.no_grad():
-        plain = network.decode(encoded)
+    now, prediction, points = told(network, encoded, replace(views, helpers=2), priors, PLAIN)
     assert set(points) <= {0, 1, 2} and points
-    assert torch.equal(prediction.depth[3:], plain.depth[3:])
-    assert not torch.equal(prediction.depth[:3], plain.depth[:3])
+    assert torch.equal(now.hints[0].nearest[3:], encoded.hints[0].nearest[3:])
+    assert not torch.equal(now.hints[0].nearest[:3], encoded.hints[0].nearest[:3])
+    with torch.no_grad():
+        assert torch.equal(prediction.depth, network.decode(now).depth)
+
+
+def test_a_draft_is_what_the_network_says_at_half_the_resolution(
+    network: Sweep, encoded: Encoded, rendered: tuple[Views, Priors, Tensor]
+) -> None:
+    """Its depths are about those of the whole, and its cameras put points at half of their coordinates."""
+    views = rendered[0]
+    with torch.no_grad():
+        draft, whole = network.draft(encoded), network.decode(encoded)
+    h, w = views.size
+    assert draft.depth.shape == draft.confidence.shape == (len(views), h // 2, w // 2)
+    pooled = 1 / F.avg_pool2d(1 / whole.depth, 2)
+    assert float((draft.depth / pooled).log().abs().median()) < 0.01
+    points = torch.tensor([[0.3, -0.2, 2.0], [-0.4, 0.1, 1.5]]).expand(len(views), 2, 3)
+    halves, places = (project(points, p.cameras.K)[0] for p in (draft, whole))
+    torch.testing.assert_close(halves, places / 2)
+    assert torch.equal(draft.cameras.world_from_cam, whole.cameras.world_from_cam)
+
+
+def test_points_of_a_draft_are_where_they_are_in_the_whole(
+    network: Sweep, encoded: Encoded, rendered: tuple[Views, Priors, Tensor]
+) -> None:
+    """In the middle of two by two pixels, with the depth there, and no nearer to COLMAP's than allowed."""
+    views, priors, truth = rendered
+    assert priors.sparse is not None
+    config = hints(hint_points=500, hint_distance=0.1)
+    with torch.no_grad():
+        found = further_points(network.draft(encoded), views, priors, config)
+    assert found
+    far = 0.1 * max(views.size)
+    for i, points in found.items():
+        assert torch.equal(points.xy % 2, torch.ones_like(points.xy))
+        x, y = (points.xy / 2).long().unbind(1)
+        true = F.avg_pool2d(truth[i][None], 2)[0][y, x]
+        assert float((points.depth / true - 1).abs().median()) < 0.02
+        assert float(torch.cdist(points.xy, priors.sparse[i].xy).min()) >= far - 2.0
+
+
+def test_views_are_reduced_by_means_and_where_all_is_valid(scene: Wall) -> None:
+    valid = torch.ones_like(scene.views.valid)
+    valid[1, 5, 9] = False
+    small = reduced(replace(scene.views, valid=valid), 2)
+    assert small.size == (24, 32) and small.names == scene.views.names
+    torch.testing.assert_close(small.images[2, 1, 3, 4], scene.views.images[2, 1, 6:8, 8:10].mean())
+    assert (~small.valid).nonzero().tolist() == [[1, 2, 4]]
 
 
 @pytest.mark.usefixtures("few_views")
