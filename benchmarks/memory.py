@@ -317,12 +317,12 @@ def run(backbone: Any, tracks: Any, views: list[Any], device: Any, steps: int) -
     from colmap_tco.predict import predict_chunk
     from colmap_tco.priors import PriorConfig
     from colmap_tco.published import NETWORKS
-    from tco.options import ConsensusConfig, PolishConfig, TCOConfig
+    from tco.options import PolishConfig, TCOConfig
 
     plain = TCOConfig(steps=steps, polish=PolishConfig(polish_looks=POLISH_LOOKS))
     toy = backbone.name not in NETWORKS
     tco = replace(plain, lora_targets=("plane",)) if toy else suited(plain, NETWORKS[backbone.name])
-    settings = (PriorConfig(), tco, ConsensusConfig(), 0)
+    settings = (PriorConfig(), tco, 0)
     predict_chunk(
         (backbone, device), tracks, views, Chunk(tuple(range(len(views)))), settings, lambda _: None
     )
