@@ -85,7 +85,7 @@ def test_bare_images_are_enough(room: Room, tmp_path: Path) -> None:
     shutil.copytree(room.root / "images", tmp_path / "images")
     found = check(tmp_path, PLAIN, Progress())
     assert f"7 images in {tmp_path / 'images'}, which densify would map first" in found.images
-    assert found.needs[0].size == (256, 192)
+    assert found.needs[0].size == (320, 240)
     alone = tmp_path / "alone" / "images"
     alone.mkdir(parents=True)
     shutil.copy(next((room.root / "images").iterdir()), alone)

@@ -253,7 +253,7 @@ def test_pictures_are_as_wide_as_in_the_published_evaluations() -> None:
     for name in ("vggt", "pi3", "da3"):
         wide = {dataset: width(BenchConfig(dataset=dataset), NETWORKS[name]) for dataset in DATASETS}
         assert wide == {"eth3d": 518, "dtu": 518, "7scenes": 518, "nrgbd": 518, "scannet": 512 // 14 * 14}
-    assert width(BenchConfig(dataset="scannet"), NETWORKS["sweep"]) == 256
+    assert width(BenchConfig(dataset="scannet"), NETWORKS["sweep"]) == 320
     assert width(BenchConfig(dataset="scannet", image_width=70), NETWORKS["vggt"]) == 70
 
 
