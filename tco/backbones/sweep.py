@@ -226,7 +226,7 @@ class Sweep(nn.Module):
         return Prediction(1 / stage.inverse, confidence, encoded.cameras, chosen, tuple(kept))
 
     def draft(self, encoded: Encoded) -> Prediction:
-        """All views without the last pass, which is what doubles the resolution: at a half, for a third."""
+        """All views without the last pass, which is what doubles the resolution."""
         every = range(len(encoded.lo))
         stage = self.coarse(encoded, every)
         for k in range(len(self.config.spacing) - 1):
