@@ -59,6 +59,8 @@ TABLES = (
     Table("marks", "marks", "marks.md"),
     Table("quality-384", "quality", "quality.md",
           ("--baselines", "--steps", "5", "--max_image_size", "384"), "384 pixels"),
+    Table("quality-256", "quality", "quality.md",
+          ("--baselines", "--steps", "0", "5", "--max_image_size", "256"), "256 pixels"),
     Table("quality-steps", "quality", "quality.md",
           ("--baselines", "--steps", "10", "20", "40"), "more steps"),
     Table("quality-seed", "quality", "quality.md",
