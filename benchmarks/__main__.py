@@ -83,7 +83,7 @@ TABLES = (
     Table("tco_step", "tco_step", "tco_step.md", ("--threads", "1", "--cpu_time")),
     Table("consensus", "consensus", "consensus.md"),
     Table("planes", "planes", "planes.md"),
-    Table("hints", "hints", "hints.md", ("--sets", "kitchen", "office", "livingroom", "--random", "8")),
+    Table("hints", "hints", "hints.md", ("--sets", "kitchen", "office", "livingroom", "--random", "8", "--size", "256")),
     Table("calibration", "calibration", "calibration.md"),
     Table("poses", "poses", "poses.md", ("--exact",)),
     Table("render", "render", "render.md"),

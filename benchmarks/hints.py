@@ -109,8 +109,9 @@ def main() -> None:
             worst = min(figures[s][1] - first[s][1] for s in drawn)
             cells += [f"{mean[0]:.3f} {mean[1]:.3f}", f"{worst:+.3f}"]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    size = "" if args.size == SIZE else f" --size {args.size}"
     told = (
-        f"`python -m benchmarks.hints --sets {' '.join(args.sets)} --random {args.random}`: "
+        f"`python -m benchmarks.hints --sets {' '.join(args.sets)} --random {args.random}{size}`: "
         f"{weights_told(weights)}, {args.size} pixels, "
         f"{args.views or 'all'} views, {args.steps} steps. Shares of the measured pixels within 2 and 5 %. "
         f"random: mean of {len(first) - len(args.sets)} scenes of the training's kinds, 10 views each, "
