@@ -4,7 +4,8 @@ The same as the tensor operations there, to rounding: those sort what all pixels
 most of their time.
 
 A loop that only computes becomes vector instructions, if it writes one array and does not look for divisions
-by zero; what is looked up and what is sorted has loops of its own.
+by zero; what is looked up and what is sorted has loops of its own. All of it is inlined: what is called
+could be linked in another form when it is read from disk than when it was compiled, and round otherwise.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ def _log(x: Any) -> Any:
     return m + (m * square * p + f32(n) * LN2_LOW - HALF * square) + f32(n) * LN2_HIGH
 
 
-@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _project(rays: Floats, depth: Floats, m: Floats, at: Floats) -> None:
     """Where a row of pixels falls in another view: u, v and z, (3, w)."""
     u, v, z = at[0], at[1], at[2]
@@ -88,7 +89,7 @@ def _project(rays: Floats, depth: Floats, m: Floats, at: Floats) -> None:
         v[i] = ((m[1, 0] * x[i] + m[1, 1] * y[i] + m[1, 2]) * depth[i] + m[1, 3]) / z[i]
 
 
-@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _look_up(maps: Floats, at: Floats, whole: float, found: Floats) -> None:
     """Inverse depth and confidence of maps (H, W, 3) where a row of pixels falls; 0, 0 if nothing counts.
 
@@ -119,7 +120,7 @@ def _look_up(maps: Floats, at: Floats, whole: float, found: Floats) -> None:
             found[1, i] = p * flat[a + one] + q * flat[b + one] + r * flat[c + one] + s * flat[d + one]
 
 
-@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _words(found: Floats, z: Floats, depth: Floats, rules: Rules, said: Floats, weights: Floats) -> None:
     """What another view says of a row of pixels (w,), and its weights, 0 where it is not asked."""
     inverse, confidence = found[0], found[1]
@@ -138,7 +139,7 @@ def _words(found: Floats, z: Floats, depth: Floats, rules: Rules, said: Floats, 
         weights[i] = confidence[i] * (depth[i] / z[i]) if asked else f32(0)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, inline="always")
 def _sort(values: Floats, weights: Floats, whose: Order, count: int) -> None:
     """Put the first so many values in order; their weights, and whose they are, with them."""
     for i in range(1, count):
@@ -150,7 +151,7 @@ def _sort(values: Floats, weights: Floats, whose: Order, count: int) -> None:
         values[j + 1], weights[j + 1], whose[j + 1] = value, weight, who
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, inline="always")
 def _heard(
     said: Floats, weighs: Floats, x: int, values: Floats, weights: Floats, whose: Order, rest: Order
 ) -> int:
@@ -180,7 +181,7 @@ def _heard(
     return count
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, inline="always")
 def _median(values: Floats, weights: Floats, count: int, share: float) -> float:
     """First of the values, in order, with which so large a share of the weights is reached."""
     total = 0.0
@@ -194,7 +195,7 @@ def _median(values: Floats, weights: Floats, count: int, share: float) -> float:
     return values[count - 1]
 
 
-@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _robust_mean(values: Floats, weights: Floats, count: int, middle: float, width: float) -> float:
     """Mean of what is near the median."""
     total = mean = f32(0)
@@ -206,7 +207,7 @@ def _robust_mean(values: Floats, weights: Floats, count: int, middle: float, wid
     return float(mean / total)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
 def _spread(values: Floats, weights: Floats, count: int, middle: float, rules: Rules, rest: Order) -> float:
     """Standard error of what was heard; the values are changed, and so is ``rest`` (S + 1,)."""
     total = squares = 0.0
@@ -222,7 +223,7 @@ def _spread(values: Floats, weights: Floats, count: int, middle: float, rules: R
     return rules.of_spread * off * math.sqrt(views) / (views - 0.8)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def ask(own: Floats, rays: Floats, asked: Asked, rules: Rules, rows: tuple[int, int], out: Floats) -> None:
     """Depths and standard errors of some rows of pixels of a view.
 

@@ -1,7 +1,8 @@
 """Compiled loops of :mod:`tco.warped`: a source's pixels looked up in a target, compared, and derived.
 
 Arrays are float32 and contiguous; pictures are (3, H, W). Divisions by zero are not looked for, without which
-the compiler makes no vector instructions of a loop.
+the compiler makes no vector instructions of a loop. Helpers are inlined: a function that is called could be
+linked in another form when it is read from disk than when it was compiled, and round otherwise.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class Found(NamedTuple):
     weight: Floats
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
 def _project(depth: Floats, m: Floats, y: int, at: Floats) -> None:
     """Where a row of pixels (w,) falls: u, v and z, and the derivatives of u and v by the depth, (5, w)."""
     py = f32(y) + HALF
@@ -134,7 +135,7 @@ def exposure(found: Found, image: Floats, matched: Any) -> float:
     return total
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST)
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def _gain(color: Floats, image: Floats, weight: Floats, total: float) -> Any:
     """Gain and bias of one channel (H, W)."""
     h, w = weight.shape
@@ -163,7 +164,7 @@ TAPS = 7
 """Of the window along an axis: of a sum of so many the compiler makes one loop of vector instructions."""
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST)
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def _along(line: Floats, kernel: Floats, out: Floats) -> None:
     """Sum under the window of a line (w + ``TAPS`` − 1,), (w,)."""
     w = len(out)
@@ -175,7 +176,7 @@ def _along(line: Floats, kernel: Floats, out: Floats) -> None:
         )  # fmt: skip
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST)
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def _across(rows: Floats, first: tuple[int, ...], kernel: Floats, out: Floats) -> None:
     """Sum under the window of some rows (·, w), added to (w,)."""
     i, j, k, l, m, n, o = first  # noqa: E741
@@ -187,7 +188,7 @@ def _across(rows: Floats, first: tuple[int, ...], kernel: Floats, out: Floats) -
         )  # fmt: skip
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST)
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def blur(plane: Floats, kernel: Floats, out: Floats) -> None:
     """Mean (H, W) of a plane (H, W) under a window, reflected about the outermost pixels.
 
@@ -211,7 +212,7 @@ def blur(plane: Floats, kernel: Floats, out: Floats) -> None:
         _along(line, kernel, out[y])
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST)
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def spread(grad: Floats, kernel: Floats, out: Floats) -> None:
     """The transpose of :func:`blur`: gradients (H, W) of the means to those of the plane."""
     h, w = grad.shape
@@ -237,7 +238,7 @@ def _parts(ma: Any, mb: Any, product: Any, squares: Any, c1: Any, c2: Any) -> tu
     return f32(2) * both + c1, f32(2) * (product - both) + c2, own + c1, squares - own + c2
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST)
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def _similar(
     means: Floats, of_image: Floats, weight: Floats, terms: tuple[float, float, float], partial: Floats
 ) -> float:
@@ -282,7 +283,7 @@ def _similar(
     return total
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST)
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def _structure(
     pair: tuple[Floats, Floats], of_image: Floats, weight: Floats, kernel: Floats,
     terms: tuple[float, float, float], work: Floats,

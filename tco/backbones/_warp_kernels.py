@@ -9,7 +9,7 @@ up, divisions by zero are not looked for (``error_model``), exponentials and log
 the few channels of a group, of which the compiler would make no vector by itself, are one by two intrinsics.
 
 numba keeps compiled code by the date of the file of a loop, and does not see changes in what the loop
-imports: helpers of the loops belong into this file.
+imports: helpers belong into this file, inlined, for what is called may round otherwise when read from disk.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def _log(x: Any) -> Any:
     return m + (m * square * p + f32(n) * LN2_LOW - HALF * square) + f32(n) * LN2_HIGH
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy", inline="always")
 def _project(m: Floats, y: int, planes: Floats, at: Floats) -> None:
     """A row of pixels in the source: u, v in units from the centre of its first pixel, z times inverse depth.
 
@@ -329,7 +329,7 @@ class Maps(NamedTuple):
     log_error: Floats
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy", inline="always")
 def _look_up(
     places: Floats, planes: Floats, maps: Maps, base: int, size: tuple[int, int], found: Floats
 ) -> None:
@@ -358,7 +358,7 @@ def _look_up(
         found[1, x] = wi * log_error[i] + wj * log_error[j] + wk * log_error[k] + wn * log_error[n]
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy", inline="always")
 def _judge(found: Floats, support: Floats, conflict: Floats, total: Floats) -> None:
     """Add to sums (w,) what a source says by what was looked up (2, w), which is changed."""
     ratio, error = found[0], found[1]
