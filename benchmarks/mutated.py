@@ -179,7 +179,7 @@ MUTATIONS = [
         ("v - HALF - f32(row)", "v - f32(row)"),
         ("(ONE - fx) * f32(column >= 0)", "(ONE - fx)"),
         ("1 - rules.half)", "rules.half)"),
-        ("_log(ONE / (inverse[x] * depth[x]))", "0.0"),
+        ("log(ONE / (inverse[x] * depth[x]))", "0.0"),
         ("weights[k] / (ONE + share * share)", "weights[k]"),
         ("/ (views - 0.8)", "/ views"),
         ("if not views > rules.fewest:", "if views > rules.fewest:"),
@@ -190,8 +190,6 @@ MUTATIONS = [
     *_of(
         "tco/backbones/_warp_kernels.py",
         "warp",
-        ("f32(1.4249322787e-1)) * m", "f32(1.3249322787e-1)) * m"),
-        ("f32(8.3334519073e-3)", "f32(8.2334519073e-3)"),
         ("planes[x if len(planes) > 1 else 0]", "planes[0]"),
         ("(ONE - fy) * scale, fy * scale", "(ONE - fy) * scale, fy"),
         ("v.times(share, part)", "part"),
@@ -199,8 +197,14 @@ MUTATIONS = [
         ("found[0, x], found[1, x] = ONE, UNSEEN", "found[0, x], found[1, x] = ONE, ONE"),
         ("z / planes[x] * theirs", "z * theirs"),
         ("gap / (f32(0.01) + min(off, f32(0.1)))", "gap / (f32(0.01) + off)"),
-        ("trust / (ONE + _exp(", "trust / (f32(2) + _exp("),
+        ("trust / (ONE + exp(", "trust / (f32(2) + exp("),
         ("support[x] /= total[x]", "support[x] /= ONE"),
+    ),
+    *_of(
+        "tco/_elementary.py",
+        "warp",
+        ("f32(1.4249322787e-1)) * m", "f32(1.3249322787e-1)) * m"),
+        ("f32(8.3334519073e-3)", "f32(8.2334519073e-3)"),
     ),
     *_of(
         "tco/_warping_kernels.py",

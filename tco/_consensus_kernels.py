@@ -11,18 +11,19 @@ could be linked in another form when it is read from disk than when it was compi
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+
+from tco._elementary import log
 
 Floats = NDArray[np.float32]
 Order = NDArray[np.int64]
 f32 = np.float32
 Index = np.uint64  # not below zero: of a signed one numba looks whether it counts from the end
 HALF, ONE = f32(0.5), f32(1.0)
-LN2_HIGH, LN2_LOW = f32(0.693359375), f32(-2.12194440e-4)
 FAST = {"reassoc", "contract", "nsz", "arcp"}  # sums in any order, but what is not finite stays so
 
 
@@ -61,19 +62,6 @@ class Rules(NamedTuple):
     half: float
     fewest: float
     of_spread: float
-
-
-@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _log(x: Any) -> Any:
-    """Natural logarithm of a positive number in float32, to 2e-7 (Cephes, ``logf``)."""
-    bits = f32(x).view(np.int32)
-    n = (bits - np.int32(0x3F3504F3)) >> np.int32(23)
-    m = np.int32(bits - (n << np.int32(23))).view(np.float32) - ONE
-    p = (f32(7.0376836292e-2) * m + f32(-1.1514610310e-1)) * m + f32(1.1676998740e-1)
-    p = ((p * m + f32(-1.2420140846e-1)) * m + f32(1.4249322787e-1)) * m + f32(-1.6668057665e-1)
-    p = ((p * m + f32(2.0000714765e-1)) * m + f32(-2.4999993993e-1)) * m + f32(3.3333331174e-1)
-    square = m * m
-    return m + (m * square * p + f32(n) * LN2_LOW - HALF * square) + f32(n) * LN2_HIGH
 
 
 @njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy", inline="always")
@@ -130,7 +118,7 @@ def _words(found: Floats, z: Floats, depth: Floats, rules: Rules, said: Floats, 
         factor = ONE + (surface - z[i]) / depth[i]
         asked = (inverse[i] > 0) & (surface > low * z[i]) & (surface < high * z[i])
         asked &= (factor > low) & (factor < high)
-        said[i] = _log(factor if asked else ONE)
+        said[i] = log(factor if asked else ONE)
     for i in range(len(z)):
         surface = ONE / max(inverse[i], f32(1e-9))
         factor = ONE + (surface - z[i]) / depth[i]
@@ -252,7 +240,7 @@ def ask(own: Floats, rays: Floats, asked: Asked, rules: Rules, rows: tuple[int, 
                 _words(found, at[2], depth, rules, said[s], weighs[s])
             own_word = said[views]
             for x in range(w):
-                own_word[x] = _log(ONE / (inverse[x] * depth[x]))
+                own_word[x] = log(ONE / (inverse[x] * depth[x]))
             for x in range(w):
                 count = _heard(said, weighs, x, values, weights, whose, rest)
                 middle = _median(values, weights, count, rules.half)

@@ -139,7 +139,7 @@ def exposure(found: Found, image: Floats, matched: Any) -> float:
 def _gain(color: Floats, image: Floats, weight: Floats, total: float) -> Any:
     """Gain and bias of one channel (H, W)."""
     h, w = weight.shape
-    mean, aim, spread, wanted = 0.0, 0.0, 0.0, 0.0
+    mean, aim, own, wanted = 0.0, 0.0, 0.0, 0.0
     for y in range(h):
         for x in range(w):
             mean += weight[y, x] * color[y, x]
@@ -147,9 +147,9 @@ def _gain(color: Floats, image: Floats, weight: Floats, total: float) -> Any:
     mean, aim = mean / total, aim / total
     for y in range(h):
         for x in range(w):
-            spread += weight[y, x] * (color[y, x] - mean) ** 2
+            own += weight[y, x] * (color[y, x] - mean) ** 2
             wanted += weight[y, x] * (image[y, x] - aim) ** 2
-    gain = min(max(np.sqrt((wanted / total + 1e-4) / (spread / total + 1e-4)), 0.5), 2.0)
+    gain = min(max(np.sqrt((wanted / total + 1e-4) / (own / total + 1e-4)), 0.5), 2.0)
     return f32(gain), f32(aim - gain * mean)
 
 
@@ -233,7 +233,7 @@ def spread(grad: Floats, kernel: Floats, out: Floats) -> None:
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def _parts(ma: Any, mb: Any, product: Any, squares: Any, c1: Any, c2: Any) -> tuple[Any, Any, Any, Any]:
-    """A, B, C and D of :func:`compare`; ``squares`` is E a² + E b²."""
+    """A, B, C and D of :func:`_similar`; ``squares`` is E a² + E b²."""
     both, own = ma * mb, ma * ma + mb * mb
     return f32(2) * both + c1, f32(2) * (product - both) + c2, own + c1, squares - own + c2
 
@@ -321,7 +321,7 @@ def compare(
         found: after :func:`exposure`.
         image: (3, H, W) of the source.
         of_image: (3, 2, H, W) means under the window of each channel and of its square.
-        kernel: (K,) of the window; empty: no structural term.
+        kernel: (``TAPS``,) of the window; empty: no structural term.
         terms: share of the structural term, and C₁ and C₂ of SSIM.
         work: (7, H, W) to write in.
         slope: (H, W) that the derivative is added to.

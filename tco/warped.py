@@ -66,10 +66,8 @@ class _Difference(torch.autograd.Function):
         image = views.images[source].contiguous().numpy()
         ours, weights = depth.detach().contiguous().numpy(), opacity.contiguous().numpy()
         terms, kernel, of_image = (config.structure, C1, C2), *_window(image, config.structure)
-        found, work = (
-            Found(np.empty_like(image), np.empty_like(image), np.empty_like(ours)),
-            np.empty((7, *ours.shape), np.float32),
-        )
+        found = Found(np.empty_like(image), np.empty_like(image), np.empty_like(ours))
+        work = np.empty((7, *ours.shape), np.float32)
         inside, whole, total, slope = 0, 0.0, 0.0, np.zeros_like(ours)
         for target in _targets(views, cameras, (source, targets), context):
             inside += look_up(ours, weights, config.occlusion_tolerance, target, found)

@@ -9,14 +9,16 @@ from __future__ import annotations
 import argparse
 import copy
 import csv
+import json
 import logging
 import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from datetime import timedelta
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -58,6 +60,9 @@ class LoopConfig:
     seed: int = 0
     weight_decay: float = 1e-4
     clip: float = 2.0
+
+
+_Config = TypeVar("_Config", bound=LoopConfig)
 
 
 class Loop(ABC):
@@ -260,6 +265,15 @@ def arguments(description: str, plain: LoopConfig) -> argparse.ArgumentParser:
     parser.add_argument("--device", default="cpu", help="cuda: several workers keep one GPU busy")
     parser.add_argument("--init", type=Path, help="weights to start from")
     return parser
+
+
+def configured(plain: _Config, args: argparse.Namespace) -> _Config:
+    """The configuration with all that the command line says of its fields; sizes are read from their file."""
+    given = {f.name: getattr(args, f.name) for f in fields(plain) if hasattr(args, f.name)}
+    sizes = given.pop("sizes")
+    if sizes is not None:
+        given["sizes"] = tuple(tuple(s) for s in json.loads(sizes.read_text()))
+    return replace(plain, **given)
 
 
 def launch(build: Callable[[int], Loop], args: argparse.Namespace, workers: int = 1) -> None:

@@ -10,7 +10,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -27,7 +27,7 @@ from tco.hints import further_points, with_more
 from tco.options import TCOConfig
 from tco.types import Priors, Views
 from training.dataset import load
-from training.loop import Loop, LoopConfig, arguments, launch
+from training.loop import Loop, LoopConfig, arguments, configured, launch
 
 CONTRAST = 10.0
 """Factor by which the pictures' local contrast may be raised."""
@@ -122,7 +122,7 @@ def slope_loss(stage: Stage, truth: Tensor, floor: Tensor) -> Tensor:
 def with_agreed(net: Sweep, encoded: Encoded, views: Views, priors: Priors, seed: int) -> Encoded:
     """The features with what all views agree on as further points, as in a run of eight views or more."""
     assert priors.sparse is not None
-    more = further_points(net.decode(encoded), views, priors, TCOConfig(), seed)
+    more = further_points(net.draft(encoded), views, priors, TCOConfig(), seed)
     told: Encoded = with_more(net, encoded, priors.sparse, more)
     return told
 
@@ -248,16 +248,7 @@ def main() -> None:
     parser.add_argument("--told", type=float, default=TrainConfig.told, help="of what views agree on")
     parser.add_argument("--workers", type=int, default=2, help="processes that share each step")
     args = parser.parse_args()
-    config = TrainConfig(
-        steps=args.steps,
-        rate=args.rate,
-        minutes=args.minutes,
-        share=args.share,
-        told=args.told,
-        seed=args.seed,
-    )
-    if args.sizes is not None:
-        config = replace(config, sizes=tuple(tuple(s) for s in json.loads(args.sizes.read_text())))
+    config = configured(TrainConfig(), args)
     launch(partial(trainer, config, args.data, args.out, args.device), args, args.workers)
 
 

@@ -7,7 +7,6 @@ says. It is made for one process on one GPU, which holds all samples; the pictur
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,7 +20,7 @@ from tco.backbones.checkpoints import load_network
 from tco.backbones.mini import MINI, fresh, write
 from tco.backbones.transformer import compute_dtype
 from tco.backbones.vggt import VGGTConfig, VGGTNetwork
-from training.loop import Loop, LoopConfig, arguments, launch
+from training.loop import Loop, LoopConfig, arguments, configured, launch
 from training.pool import Held, Pool, gathered, hold
 from training.supervision import losses
 
@@ -128,18 +127,9 @@ def main() -> None:
     parser.add_argument("--stop", type=float, default=plain.stop, help="minutes after which this run stops")
     parser.add_argument("--pixels", type=int, default=plain.pixels, help="of all pictures of a batch")
     args = parser.parse_args()
-    config = replace(
-        plain,
-        steps=args.steps,
-        rate=args.rate,
-        minutes=args.minutes,
-        stop=args.stop,
-        pixels=args.pixels,
-        seed=args.seed,
-    )
+    config = configured(plain, args)
     if args.sizes is not None:
-        sizes = tuple(tuple(s) for s in json.loads(args.sizes.read_text()))
-        config = replace(config, sizes=sizes, shape=sizes[-1][1:])
+        config = replace(config, shape=config.sizes[-1][1:])
     launch(partial(trainer, config, args.data, args.out, args.device), args)
 
 

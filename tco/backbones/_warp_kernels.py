@@ -9,7 +9,8 @@ up, divisions by zero are not looked for (``error_model``), exponentials and log
 the few channels of a group, of which the compiler would make no vector by itself, are one by two intrinsics.
 
 numba keeps compiled code by the date of the file of a loop, and does not see changes in what the loop
-imports: helpers belong into this file, inlined, for what is called may round otherwise when read from disk.
+imports: helpers that may change belong into this file, inlined, for what is called may round otherwise when
+read from disk.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
+
+from tco._elementary import exp, log
 
 Floats = NDArray[np.float32]
 Kernel = Callable[..., None]
@@ -60,33 +63,7 @@ Index = np.uint64  # not below zero: of a signed one numba looks whether it coun
 f32 = np.float32
 UNSEEN = f32(80.0)
 """Logarithm of an error that is worth nothing."""
-HALF, ONE, LOG2_E = f32(0.5), f32(1.0), f32(1.44269504)
-LN2_HIGH, LN2_LOW = f32(0.693359375), f32(-2.12194440e-4)
-
-
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy", inline="always")
-def _exp(x: Any) -> Any:
-    """e to the power of x in float32, to 1e-7 of it (Cephes, ``expf``)."""
-    x = min(max(x, f32(-87.0)), f32(88.0))
-    n = np.floor(x * LOG2_E + HALF)
-    r = x - n * LN2_HIGH - n * LN2_LOW
-    p = (f32(1.9875691500e-4) * r + f32(1.3981999507e-3)) * r + f32(8.3334519073e-3)
-    p = ((p * r + f32(4.1665795894e-2)) * r + f32(1.6666665459e-1)) * r + f32(5.0000001201e-1)
-    power = np.int32((np.int32(n) + np.int32(127)) << np.int32(23)).view(np.float32)
-    return (p * r * r + r + ONE) * power
-
-
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy", inline="always")
-def _log(x: Any) -> Any:
-    """Natural logarithm of a positive number in float32, to 2e-7 (Cephes, ``logf``)."""
-    bits = f32(x).view(np.int32)
-    n = (bits - np.int32(0x3F3504F3)) >> np.int32(23)
-    m = np.int32(bits - (n << np.int32(23))).view(np.float32) - ONE
-    p = (f32(7.0376836292e-2) * m + f32(-1.1514610310e-1)) * m + f32(1.1676998740e-1)
-    p = ((p * m + f32(-1.2420140846e-1)) * m + f32(1.4249322787e-1)) * m + f32(-1.6668057665e-1)
-    p = ((p * m + f32(2.0000714765e-1)) * m + f32(-2.4999993993e-1)) * m + f32(3.3333331174e-1)
-    square = m * m
-    return m + (m * square * p + f32(n) * LN2_LOW - HALF * square) + f32(n) * LN2_HIGH
+HALF, ONE = f32(0.5), f32(1.0)
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy", inline="always")
@@ -363,11 +340,11 @@ def _judge(found: Floats, support: Floats, conflict: Floats, total: Floats) -> N
     """Add to sums (w,) what a source says by what was looked up (2, w), which is changed."""
     ratio, error = found[0], found[1]
     for x in range(len(total)):
-        off, gap = _exp(error[x]), _log(ratio[x])
+        off, gap = exp(error[x]), log(ratio[x])
         trust = f32(0.02) / (f32(0.02) + off)
         share = gap / (f32(0.01) + min(off, f32(0.1)))
-        ratio[x] = trust * _exp(-HALF * share * share)
-        error[x] = trust / (ONE + _exp(min(f32(2.0) * (share + f32(2.0)), f32(60.0))))
+        ratio[x] = trust * exp(-HALF * share * share)
+        error[x] = trust / (ONE + exp(min(f32(2.0) * (share + f32(2.0)), f32(60.0))))
         total[x] += trust
     for x in range(len(total)):
         support[x] += ratio[x]
