@@ -173,7 +173,7 @@ MUTATIONS = [
     *_of(
         "tco/_consensus_kernels.py",
         "consensus consensus_loops",
-        ("factor = ONE + (surface - z[i]) / depth[i]", "factor = surface / z[i]"),
+        ("(ONE / max(inverse[i], f32(1e-9)) - z[i]) / depth[i]", "(ONE / inverse[i] - z[i]) / z[i]"),
         ("confidence[i] * (depth[i] / z[i])", "confidence[i]"),
         ("s * flat[d + two] > whole", "s * flat[d + two] > 0.5"),
         ("v - HALF - f32(row)", "v - f32(row)"),
@@ -243,7 +243,7 @@ MUTATIONS = [
         ("FEWEST_VIEWS or uncertain:", "FEWEST_VIEWS:"),
         ("i: joined(given[i], points) for", "i: points for"),
         ("scaled(points, factor) for", "points for"),
-        ("invalid == 0", "invalid < 1"),
+        ("invalid == 0", "invalid == 1"),
         ("cameras=prediction.cameras, sparse=", "sparse="),
     ),
     *_of(

@@ -110,15 +110,12 @@ def _look_up(maps: Floats, at: Floats, whole: float, found: Floats) -> None:
 
 @njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _words(found: Floats, z: Floats, depth: Floats, rules: Rules, said: Floats, weights: Floats) -> None:
-    """What another view says of a row of pixels (w,), and its weights, 0 where it is not asked."""
+    """What another view says of a row of pixels (w,), and its weights; without any it says nothing."""
     inverse, confidence = found[0], found[1]
     low, high = f32(rules.low), f32(rules.high)
     for i in range(len(z)):
-        surface = ONE / max(inverse[i], f32(1e-9))
-        factor = ONE + (surface - z[i]) / depth[i]
-        asked = (inverse[i] > 0) & (surface > low * z[i]) & (surface < high * z[i])
-        asked &= (factor > low) & (factor < high)
-        said[i] = log(factor if asked else ONE)
+        factor = ONE + (ONE / max(inverse[i], f32(1e-9)) - z[i]) / depth[i]
+        said[i] = log(max(factor, low))
     for i in range(len(z)):
         surface = ONE / max(inverse[i], f32(1e-9))
         factor = ONE + (surface - z[i]) / depth[i]

@@ -284,6 +284,21 @@ def test_points_of_a_draft_are_where_they_are_in_the_whole(
         assert float(torch.cdist(points.xy, priors.sparse[i].xy).min()) >= far - 2.0
 
 
+@pytest.mark.parametrize(("share", "asked"), [(0.7, True), (1.4, False)])
+def test_cameras_are_as_uncertain_at_half_the_resolution(
+    network: Sweep, encoded: Encoded, rendered: tuple[Views, Priors, Tensor], share: float, asked: bool
+) -> None:
+    """How far they move a pixel is in parts of the picture, of whatever size it is."""
+    views, priors, _ = rendered
+    assert priors.cameras is not None
+    bound = PLAIN.consensus.consensus_uncertainty * max(views.size)
+    sigma = torch.full((len(views),), share * bound) / priors.cameras.K[:, 0, 0]
+    with torch.no_grad():
+        draft = network.draft(encoded)
+    found = further_points(draft, views, replace(priors, rotation_sigma=sigma), PLAIN)
+    assert bool(found) is asked
+
+
 def test_views_are_reduced_by_means_and_where_all_is_valid(scene: Wall) -> None:
     valid = torch.ones_like(scene.views.valid)
     valid[1, 5, 9] = False
