@@ -57,6 +57,8 @@ def variants() -> Iterator[tuple[str, ConsensusConfig]]:
         yield f"plane_trust {trust}", replace(plain, plane_trust=trust)
     for smoothness in (1.0, 4.0):
         yield f"plane_smoothness {smoothness}", replace(plain, plane_smoothness=smoothness)
+    for square in (0.0, 1.0):
+        yield f"plane_square {square}", replace(plain, plane_square=square)
 
 
 def random_scene(seed: int) -> tuple[Views, Priors, Tensor] | None:

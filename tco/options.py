@@ -160,11 +160,18 @@ class ConsensusConfig:
         "pixels; raise it for larger planes with straighter borders",
     )
 
+    plane_square: float = knob(
+        0.5,
+        "where most surfaces of a scene face along three directions at right angles: most that it costs a "
+        "pixel to be on a plane that does not; 0: such directions are not looked for",
+    )
+
     def __post_init__(self) -> None:
         if self.planes < 0 or not 0 < self.plane_share < 1:
             raise ValueError("planes must not be negative, and plane_share between 0 and 1")
-        if self.plane_trust <= 0 or self.plane_smoothness < 0:
-            raise ValueError("plane_trust must be positive, and plane_smoothness not negative")
+        if self.plane_trust <= 0:
+            raise ValueError("plane_trust must be positive")
+        check_range(self, "plane_smoothness plane_square", 0)
         if self.consensus_rounds < 0 or self.consensus_views < 1:
             raise ValueError("consensus_rounds must not be negative, and consensus_views at least 1")
         if not (self.consensus_reach > 0 and self.consensus_width > 0):

@@ -8,7 +8,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from tco.options import ConsensusConfig
-from tco.planar.view import Bools, Floats, Labels, Plane, Shown, normals
+from tco.planar.frame import TILT, Frame
+from tco.planar.view import Bools, Floats, Labels, Plane, Shown, guessed, normals, within
 
 LEAST, MOST = 0.01, 0.1
 """Bounds of the relative error of a depth that is compared with a plane: no confidence makes it smaller, and
@@ -27,6 +28,8 @@ FEWEST = 50
 """Pixels that make a plane."""
 STEPS = 5
 """Of each robust fit."""
+NEARLY = 10.0
+"""Degrees from a direction of the scene within which a plane is expected to face along it."""
 ALIKE = 1.2e-3
 """Share of a view that errs as one: a plane's covariance is of so many independent errors, not of pixels."""
 
@@ -152,16 +155,18 @@ def _least_squares(points: Floats, weight: Floats, like: Floats) -> tuple[Floats
 
 def _plane(pixels: _Pixels, normal: Floats, offset: float) -> Plane:
     """With a centre in the middle of pixels and two axes, and no covariance yet."""
-    axis = np.eye(3, dtype=np.float32)[int(np.abs(normal).argmin())]
-    u = np.cross(normal, axis)
-    u /= np.linalg.norm(u)
-    centre = pixels.weight @ pixels.points / max(float(pixels.weight.sum()), 1e-12)
-    return Plane(normal, offset, centre, np.stack([u, np.cross(normal, u)]), np.zeros((3, 3)))
+    return Plane(normal, offset, _middle(pixels), within(normal), np.zeros((3, 3)))
+
+
+def _middle(pixels: _Pixels) -> Floats:
+    """Weighted mean (3,) of the points."""
+    return np.asarray(pixels.weight @ pixels.points / max(float(pixels.weight.sum()), 1e-12))
 
 
 def refit(
-    views: Sequence[Shown], labels: Sequence[Labels], planes: Sequence[Plane], config: ConsensusConfig
-) -> list[Plane]:
+    views: Sequence[Shown], labels: Sequence[Labels], planes: Sequence[Plane], config: ConsensusConfig,
+    frame: Frame | None = None,
+) -> list[Plane]:  # fmt: skip
     """Planes fitted to the pixels that took them, with covariances; those that too few took are gone.
 
     Args:
@@ -169,8 +174,10 @@ def refit(
         labels: (H, W) of each, plane k as k + 1.
         planes: that they could take.
         config: share of all pixels that a plane needs.
+        frame: directions, if the scene has any, that planes near them are expected to face along.
     """
     total, found = sum(int(view.known.sum()) for view in views), list[Plane]()
+    stands_for = 1 / (ALIKE * labels[0].size)
     for k, plane in enumerate(planes):
         parts = []
         for view, label in zip(views, labels, strict=True):
@@ -179,15 +186,58 @@ def refit(
         pixels = _Pixels.joined(parts)
         if len(pixels.depth) < max(FEWEST, config.plane_share * total):
             continue
-        normal, offset = plane.normal, plane.offset
-        for _ in range(STEPS):
-            across = pixels.across(normal)
-            off = (pixels.points @ normal - offset) / across / bounded(pixels.error)
-            weight = pixels.weight / across**2 / (1 + off**2) ** 2
-            normal, offset = _least_squares(pixels.points, weight, normal)
-        fitted = _plane(pixels, normal, offset)
-        found.append(_with_covariance(fitted, pixels, 1 / (ALIKE * labels[0].size)))
+        if plane.guess is not None:
+            found.append(
+                _likeliest(pixels, plane, plane.guess, np.linalg.inv(plane.guess.covariance), stands_for)
+            )
+        elif frame is not None and float(frame.astray(plane.normal)) < NEARLY:
+            normal, middle = frame.nearest(plane.normal), _middle(pixels)
+            guess = guessed(normal, float(normal @ middle), middle, TILT, 1.0)
+            precision = np.diag([*(1 / guess.covariance.diagonal()[:2]), 0.0])
+            found.append(_likeliest(pixels, plane, guess, precision, stands_for))
+        else:
+            found.append(_fitted(pixels, plane, stands_for))
     return found
+
+
+def _fitted(pixels: _Pixels, plane: Plane, stands_for: float) -> Plane:
+    """The plane fitted to pixels alone, robustly, from what it was; see :func:`_with_covariance`."""
+    normal, offset = plane.normal, plane.offset
+    for _ in range(STEPS):
+        across = pixels.across(normal)
+        off = (pixels.points @ normal - offset) / across / bounded(pixels.error)
+        weight = pixels.weight / across**2 / (1 + off**2) ** 2
+        normal, offset = _least_squares(pixels.points, weight, normal)
+    return _with_covariance(_plane(pixels, normal, offset), pixels, stands_for)
+
+
+def _likeliest(pixels: _Pixels, plane: Plane, guess: Plane, precision: Floats, stands_for: float) -> Plane:
+    """The plane of the highest probability by pixels and by a guess, from what it was, and its covariance.
+
+    Args:
+        pixels: with errors that are not bounded.
+        plane: what it was.
+        guess: whose centre is on it.
+        precision: (3, 3) inverse of the covariance of its slopes and its offset.
+        stands_for: number of independent errors that a pixel stands for.
+    """
+    n, (u, v), middle = guess.normal, guess.axes, guess.centre
+    across, error = pixels.across(n), pixels.error.clip(LEAST)
+    at = np.concatenate([(pixels.points - middle) @ guess.axes.T, np.ones((len(across), 1))], -1)
+    at = at.astype(np.float64)
+    off = ((pixels.points - middle) @ n).astype(np.float64)
+    now = np.array([-plane.normal @ u, -plane.normal @ v, plane.offset - plane.normal @ middle])
+    now = now.astype(np.float64) / float(plane.normal @ n)
+    for _ in range(STEPS):
+        missed = (off - at @ now) / across / bounded(pixels.error)
+        information = stands_for / (error * across).astype(np.float64) ** 2 / (1 + missed**2) ** 2
+        normal_equations = at.T @ (information[:, None] * at) + precision
+        now = np.linalg.solve(normal_equations, at.T @ (information * off))
+    normal = n - now[0] * u - now[1] * v
+    length = float(np.linalg.norm(normal))
+    offset = float(normal @ middle + now[2]) / length
+    covariance = np.linalg.inv(normal_equations)
+    return Plane((normal / length).astype(np.float32), offset, middle, guess.axes, covariance, plane.guess)
 
 
 def _with_covariance(plane: Plane, pixels: _Pixels, stands_for: float) -> Plane:

@@ -11,7 +11,8 @@ from scipy.ndimage import gaussian_filter
 from tco.options import ConsensusConfig
 from tco.planar._kernels import least_labels
 from tco.planar.fit import SURE
-from tco.planar.view import SIDE, Floats, Labels, Plane, Shown
+from tco.planar.frame import Frame
+from tco.planar.view import SIDE, Floats, Labels, Plane, Shown, normals, span
 
 WIDE = 2.0
 """A plane that departs from a depth by this many times its error costs half of ``plane_trust``."""
@@ -23,9 +24,21 @@ EDGE, ACROSS = 0.05, 0.2
 """Step of the colours, of 1, over which a border of labels gets cheaper; the least share of its cost."""
 STEP, CHANGE = 0.1, 0.1
 """Step of the logarithm of depth that costs a border as a whole; share of it that a change of labels adds."""
-BINS, UNLIKE, MOST_UNLIKE, SHRINK = 8, 0.3, 3.0, 2e-3
+BINS, UNLIKE, MOST_UNLIKE, SHRINK = 8, 0.6, 3.0, 2e-3
 """Bins of each channel; weight of how much rarer a colour is on the plane than in the view, in powers of e;
 the most that counts; share of a view, in sure pixels, that makes the colours of a plane known."""
+FREE, ASKEW = 6.0, 5.0
+"""Degrees from a direction of the scene up to which a plane faces along it; how many more cost half of
+``plane_square``."""
+KEPT, DOUBTFUL = 0.2, 0.1
+"""Cost of keeping a depth, though the surface is slanted to all directions, in units of ``plane_square``; the
+relative error at which it is half of that."""
+SLANTED, REACH = (10.0, 25.0), 6.0
+"""Degrees from a direction at which a surface begins to be slanted, and at which it is altogether; pixels to
+each side over which its normal is taken."""
+NEAR = 0.05
+"""Relative error that larger ones count as where the colours of a plane are gathered: what is hardly known at
+all is near every plane."""
 NEVER = 1e3
 """Cost of what cannot be: a plane behind the camera, or one where there is no depth."""
 SWEEPS = 3
@@ -34,19 +47,25 @@ WORTH, FEW = 1 / 8, 1e-3
 """A plane is tried if it costs less than this share of ``plane_trust`` at such a share of a view or more."""
 
 
-def labelled(view: Shown, planes: Sequence[Plane], config: ConsensusConfig) -> Labels:
+def labelled(
+    view: Shown, planes: Sequence[Plane], config: ConsensusConfig, frame: Frame | None = None
+) -> Labels:
     """(H, W): 0 where a pixel keeps its depth, k + 1 where plane k of the list is its surface.
 
     Args:
         view: with its depths.
         planes: that it may take.
         config: how much depths are trusted, and how much borders cost.
+        frame: directions, if the scene has any, along which surfaces are likelier to face.
     """
     colours = colour_bins(view)
-    tried, costs, logs = [0], [np.zeros_like(view.depth)], [np.log(view.depth)]
+    keep = np.zeros_like(view.depth) if frame is None else cost_of_keeping(view, frame, config)
+    tried, costs, logs = [0], [keep], [np.log(view.depth)]
     for k, plane in enumerate(planes):
         depth = plane.depth(view)
         cost = cost_of(view, plane, depth, colours, config)
+        if frame is not None:
+            cost = np.minimum(cost + cost_of_facing(plane, frame, config), NEVER)
         if ((cost < WORTH * config.plane_trust) & (cost < NEVER)).mean() >= FEW:
             tried.append(k + 1)
             costs.append(cost)
@@ -66,9 +85,27 @@ def cost_of(view: Shown, plane: Plane, depth: Floats, colours: Labels, config: C
     apart = (off / (WIDE * view.error).clip(LEAST, MOST)) ** 2
     cost = config.plane_trust * apart / (1 + apart)
     cost += DOUBT * (plane.error(view, depth) / UNSURE) ** 2
-    near = np.exp(-0.5 * (off / view.error.clip(LEAST / WIDE, MOST / WIDE)) ** 2) * there
+    near = np.exp(-0.5 * (off / view.error.clip(LEAST / WIDE, NEAR)) ** 2) * there
     cost += UNLIKE * rarity(colours, view.sure.clip(0, SURE), near)[colours]
     return np.where(there, cost.clip(0, NEVER), NEVER).astype(np.float32)
+
+
+def cost_of_facing(plane: Plane, frame: Frame, config: ConsensusConfig) -> float:
+    """What it costs a pixel that a plane does not face along a direction of the scene."""
+    times = max(0.0, float(frame.astray(plane.normal)) - FREE) / ASKEW
+    return config.plane_square * times**2 / (1 + times**2)
+
+
+def cost_of_keeping(view: Shown, frame: Frame, config: ConsensusConfig) -> Floats:
+    """What it costs (H, W) to keep a depth that is unsure, of a surface slanted to all directions."""
+    n = normals(view, REACH)
+    low, high = SLANTED
+    slanted = ((frame.astray(n) - low) / (high - low)).clip(0, 1) * (n != 0).any(-1)
+    r = span(view, REACH)
+    if min(view.depth.shape) > 2 * r:
+        slanted = np.pad(slanted[r:-r, r:-r], r, mode="edge")
+    unsure = (view.error / DOUBTFUL) ** 2
+    return np.asarray(KEPT * config.plane_square * slanted * unsure / (1 + unsure), np.float32)
 
 
 def colour_bins(view: Shown) -> Labels:

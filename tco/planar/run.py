@@ -15,6 +15,8 @@ from torch import Tensor
 from tco.consensus import Agreement, agreed
 from tco.options import ConsensusConfig
 from tco.planar.fit import find, refit
+from tco.planar.frame import Frame, edges, frame_of
+from tco.planar.hinges import hinged
 from tco.planar.label import labelled
 from tco.planar.view import Plane, Shown, shown
 from tco.types import Cameras, Prediction, Priors, Views
@@ -105,11 +107,16 @@ def flattened(
     planes = find(map(show, range(count)), count, config, np.random.default_rng(seed))
     stride = min(max(2, math.ceil(math.sqrt(count / SHARED))), min(views.size) // SMALLEST)
     some = [show(i, stride) for i in range(count)]
+    frame = None
+    if config.plane_square > 0:
+        frame = frame_of(some, planes, [edges(show(i)) for i in range(count)])
+    if frame is not None:
+        planes += hinged(some, frame, planes)
     with ThreadPoolExecutor(min(torch.get_num_threads(), WORKERS)) as pool:
         for _ in range(ROUNDS):
-            labels = list(pool.map(partial(labelled, planes=planes, config=config), some))
-            planes = refit(some, labels, planes, config)
-        of_view = partial(_view_on_planes, agreement, show, planes, config)
+            labels = list(pool.map(partial(labelled, planes=planes, config=config, frame=frame), some))
+            planes = refit(some, labels, planes, config, frame)
+        of_view = partial(_view_on_planes, agreement, show, planes, config, frame)
         results = list(pool.map(of_view, views.wanted))
     depth, error = prediction.depth.clone(), agreement.error.clone()
     for i, (flat, spread, label) in zip(views.wanted, results, strict=True):
@@ -119,12 +126,13 @@ def flattened(
 
 
 def _view_on_planes(
-    agreement: Agreement, show: Callable[..., Shown], planes: Sequence[Plane], config: ConsensusConfig, i: int
-) -> tuple[Tensor, Tensor, Tensor]:
+    agreement: Agreement, show: Callable[..., Shown], planes: Sequence[Plane], config: ConsensusConfig,
+    frame: Frame | None, i: int,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Depth, standard error and labels (H, W) of one view."""
     view = show(i)
     stride = math.ceil(math.sqrt(view.depth.size / LARGEST))
-    label = labelled(view if stride == 1 else show(i, stride), planes, config)
+    label = labelled(view if stride == 1 else show(i, stride), planes, config, frame)
     if stride > 1:
         rows, columns = (np.minimum(np.arange(n) // stride, n // stride - 1) for n in view.depth.shape)
         label = label[rows[:, None], columns]

@@ -79,10 +79,15 @@ def shown(prediction: Prediction, cameras: Cameras, views: Views, i: int, stride
     )  # fmt: skip
 
 
-def normals(view: Shown) -> Floats:
-    """(H, W, 3) of the surface, over some pixels to each side; zeros at borders and beside unknown depths."""
+def span(view: Shown, reach: float) -> int:
+    """A length in pixels of views of ``SIDE``² pixels in pixels of this view, at least one."""
+    return max(1, round(reach * view.side / SIDE))
+
+
+def normals(view: Shown, reach: float = REACH) -> Floats:
+    """(H, W, 3) of the surface over ``reach`` pixels to each side; 0 at borders and beside unknown depths."""
     h, w = view.depth.shape
-    r = max(1, round(REACH * view.side / SIDE))
+    r = span(view, reach)
     found = np.zeros((h, w, 3), np.float32)
     if min(h, w) <= 2 * r:
         return found
@@ -109,6 +114,7 @@ class Plane:
         axes: (2, 3) directions in the plane.
         covariance: (3, 3) of (a, b, c), where the plane's error at centre + u axes[0] + v axes[1] is
             a u + b v + c along n; zeros before the first fit to labels.
+        guess: what it was put up as before any pixel took it, if it was not found among pixels.
 
     A point on a ray of direction r is (n·X − d) / (n·r) deeper than the plane, so that errors of depth are
     |n·r| times as large along n.
@@ -119,6 +125,7 @@ class Plane:
     centre: Floats
     axes: Floats
     covariance: Floats
+    guess: Plane | None = None
 
     def depth(self, view: Shown) -> Floats:
         """Depth (H, W) of the plane at the pixels of a view, 0 where it is behind the camera."""
@@ -134,3 +141,17 @@ class Plane:
         variance = ((at @ self.covariance) * at).sum(-1)
         along = np.abs(view.directions @ self.normal).clip(1e-6)
         return np.sqrt(variance.clip(0)) / along / depth.clip(1e-6)
+
+
+def guessed(normal: Floats, offset: float, centre: Floats, tilt: float, sigma: float) -> Plane:
+    """A plane through ``centre`` (3,) with a normal uncertain by ``tilt`` degrees, an offset by ``sigma``."""
+    variance = np.square([math.radians(tilt), math.radians(tilt), sigma])
+    return Plane(normal, offset, centre, within(normal), np.diag(variance))
+
+
+def within(normal: Floats) -> Floats:
+    """Two directions (2, 3) in the plane of a normal (3,), at right angles."""
+    axis = np.eye(3, dtype=np.float32)[int(np.abs(normal).argmin())]
+    u = np.cross(normal, axis)
+    u /= np.linalg.norm(u)
+    return np.stack([u, np.cross(normal, u)])
