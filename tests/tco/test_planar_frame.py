@@ -190,6 +190,24 @@ def test_directions_are_fitted_to_normals(degrees: float) -> None:
     assert np.linalg.det(found) == pytest.approx(1)
 
 
+def test_a_large_floor_does_not_decide_on_all_three() -> None:
+    """A thousand normals of it lean by 3°, a hundred of each wall are exact: the roots of both decide."""
+    axes = room().axes
+    lean = so3_exp(torch.from_numpy(math.radians(3.0) * axes[1])[None])[0].numpy()
+    n = np.concatenate([np.repeat(axes[:1] @ lean.T, 1000, 0), np.repeat(axes[1:], 100, 0)])
+    found = by_normals(n, np.ones(len(n)), axes)
+    expected = 3 * math.sqrt(1000) / (math.sqrt(1000) + math.sqrt(100))
+    assert degrees_off(found, axes) == pytest.approx(expected, rel=0.02)
+
+
+def test_the_nearest_direction_is_on_the_side_of_the_normal(scene: Room) -> None:
+    frame = Frame(scene.axes)
+    for k, sign in ((0, 1), (1, -1), (2, 1), (2, -1)):
+        normal = sign * tilted(scene.axes, 8)[k]
+        assert np.allclose(frame.nearest(normal), sign * scene.axes[k])
+        assert 0 < float(frame.astray(normal)) <= 8 + 1e-6
+
+
 def lines_along(axes: Floats, counts: tuple[int, int, int], seed: int = 2) -> tuple[Floats, Floats]:
     """Normals of planes that hold an axis, to 0.1°, and as many of any; lengths."""
     rng = np.random.default_rng(seed)
