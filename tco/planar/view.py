@@ -136,11 +136,13 @@ class Plane:
 
     def error(self, view: Shown, depth: Floats) -> Floats:
         """Relative standard error (H, W) of these depths of the plane, by its covariance."""
-        points = view.centre + view.directions * depth[..., None] - self.centre
-        at = np.concatenate([points @ self.axes.T, np.ones((*depth.shape, 1))], -1)
-        variance = ((at @ self.covariance) * at).sum(-1)
+        values, vectors = np.linalg.eigh(self.covariance)
+        root = vectors * np.sqrt(values.clip(0))  # root @ root.T is the covariance
+        turned = self.axes.T @ root[:2]
+        points = view.centre + view.directions * depth[..., None]
+        parts = points @ turned.astype(points.dtype) + (root[2] - self.centre @ turned).astype(points.dtype)
         along = np.abs(view.directions @ self.normal).clip(1e-6)
-        return np.sqrt(variance.clip(0)) / along / depth.clip(1e-6)
+        return np.sqrt(np.einsum("...i,...i", parts, parts)) / along / depth.clip(1e-6)
 
 
 def guessed(normal: Floats, offset: float, centre: Floats, tilt: float, sigma: float) -> Plane:
