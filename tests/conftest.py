@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+import signal
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
     from training.scenes import Sample
 
 _pycolmap.load()  # in the order that keeps PNG writing alive, before any test module imports pycolmap
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's background job, whose children would be deaf
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 DISTORTIONS = {
     "SIMPLE_PINHOLE": [],
