@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 _pycolmap.load()  # in the order that keeps PNG writing alive, before any test module imports pycolmap
 
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's background job, whose children would be deaf
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as of a shell's background jobs
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 DISTORTIONS = {
