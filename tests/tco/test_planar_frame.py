@@ -154,7 +154,7 @@ def test_a_slanted_wall_does_not_turn_them() -> None:
 
 
 def test_without_edges_along_them_there_are_none(scene: Room) -> None:
-    views, depth = scene.shown(scene.depth), scene.depth
+    views = scene.shown(scene.depth)
     planes = find(views, len(views), CONFIG, np.random.default_rng(0))
     rng = np.random.default_rng(0)
     anywhere = rng.standard_normal((400, 3))
@@ -163,7 +163,6 @@ def test_without_edges_along_them_there_are_none(scene: Room) -> None:
     plain = [replace(view, image=np.full_like(view.image, 0.5)) for view in views]
     assert frame_of(views, planes, [edges(view) for view in plain]) is None
     assert frame_of(views, [], [edges(view) for view in views]) is None
-    assert not depth.isnan().any()
 
 
 def test_normals_that_face_anywhere_have_no_directions(scene: Room) -> None:
