@@ -25,7 +25,7 @@ from torch import Tensor
 from tco.backbones.base import Backbone, Drafts
 from tco.consensus import Agreement
 from tco.options import TCOConfig
-from tco.planar.run import together
+from tco.planar.run import OnPlanes, together
 from tco.polish import displacement
 from tco.types import Prediction, Priors, SparseDepth, Views
 
@@ -106,8 +106,22 @@ def further_points(
             ),
         )
     flat = together(prediction, prediction.cameras, views, priors, config.consensus, seed)
-    found = agreed_points(flat.agreement, views, priors.sparse or (), config, seed)
+    found = agreed_points(as_planes_are(flat), views, priors.sparse or (), config, seed)
     return {i: scaled(points, factor) for i, points in found.items()}
+
+
+def as_planes_are(flat: OnPlanes) -> Agreement:
+    """What the views agree on, where pixels on a plane are known as well as it is.
+
+    How far apart the views were there is of no account any more. Nor is what the network thought of its
+    depths, if the plane faces along a direction of the scene (:mod:`tco.planar.frame`): that it was unsure is
+    why it should be told. Other planes may be a guess where nothing is sure, on gentle hills for instance.
+    """
+    prediction, on = flat.agreement.prediction, flat.labels > 0
+    square = torch.tensor([False, *flat.square])[flat.labels]
+    confidence = prediction.confidence.masked_fill(square, torch.inf)
+    error = torch.where(on, flat.error, flat.agreement.error)
+    return Agreement(replace(prediction, confidence=confidence), error)
 
 
 def reduced(views: Views, factor: int) -> Views:

@@ -190,8 +190,14 @@ class HintsConfig:
         "what it said before, in groups of eight views or more; 0: it is given COLMAP's points alone",
     )
     hint_points: int = knob(300, "further points of a view, at most")
-    hint_error: float = knob(0.01, "largest relative standard error of an agreed depth that becomes a point")
-    hint_confidence: float = knob(1.3, "least confidence of a depth that becomes a point")
+    hint_error: float = knob(
+        0.01,
+        "largest relative standard error of an agreed depth, or of the plane it is on, that becomes a point",
+    )
+    hint_confidence: float = knob(
+        1.3,
+        "least confidence of a depth that becomes a point; planes at right angles to others need none",
+    )
     hint_distance: float = knob(
         0.04, "least distance of a further point from COLMAP's, as a share of the longer side of the picture"
     )

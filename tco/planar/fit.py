@@ -190,7 +190,7 @@ def refit(
             found.append(
                 _likeliest(pixels, plane, plane.guess, np.linalg.inv(plane.guess.covariance), stands_for)
             )
-        elif frame is not None and float(frame.astray(plane.normal)) < NEARLY:
+        elif frame is not None and faces_along(plane, frame):
             normal, middle = frame.nearest(plane.normal), _middle(pixels)
             guess = guessed(normal, float(normal @ middle), middle, TILT, 1.0)
             precision = np.diag([*(1 / guess.covariance.diagonal()[:2]), 0.0])
@@ -198,6 +198,11 @@ def refit(
         else:
             found.append(_fitted(pixels, plane, stands_for))
     return found
+
+
+def faces_along(plane: Plane, frame: Frame) -> bool:
+    """Whether a plane is one that is expected to face along a direction of the scene."""
+    return float(frame.astray(plane.normal)) < NEARLY
 
 
 def _fitted(pixels: _Pixels, plane: Plane, stands_for: float) -> Plane:

@@ -10,7 +10,6 @@ from scipy.ndimage import gaussian_filter
 
 from tco.options import ConsensusConfig
 from tco.planar._kernels import least_labels
-from tco.planar.fit import SURE
 from tco.planar.frame import Frame
 from tco.planar.view import SIDE, Floats, Labels, Plane, Shown, normals, span
 
@@ -24,9 +23,12 @@ EDGE, ACROSS = 0.05, 0.2
 """Step of the colours, of 1, over which a border of labels gets cheaper; the least share of its cost."""
 STEP, CHANGE = 0.1, 0.1
 """Step of the logarithm of depth that costs a border as a whole; share of it that a change of labels adds."""
-BINS, UNLIKE, MOST_UNLIKE, SHRINK = 8, 0.6, 3.0, 2e-3
+BINS, UNLIKE, MOST_UNLIKE, SHRINK = 8, 1.5, 3.0, 2e-3
 """Bins of each channel; weight of how much rarer a colour is on the plane than in the view, in powers of e;
 the most that counts; share of a view, in sure pixels, that makes the colours of a plane known."""
+CERTAIN = 3.0
+"""Confidence above 1 from which on a pixel counts no more for the colours of a plane; below that it counts
+with the square, as an inverse variance."""
 FREE, ASKEW = 6.0, 5.0
 """Degrees from a direction of the scene up to which a plane faces along it; how many more cost half of
 ``plane_square``."""
@@ -86,7 +88,7 @@ def cost_of(view: Shown, plane: Plane, depth: Floats, colours: Labels, config: C
     cost = config.plane_trust * apart / (1 + apart)
     cost += DOUBT * (plane.error(view, depth) / UNSURE) ** 2
     near = np.exp(-0.5 * (off / view.error.clip(LEAST / WIDE, NEAR)) ** 2) * there
-    cost += UNLIKE * rarity(colours, view.sure.clip(0, SURE), near)[colours]
+    cost += UNLIKE * rarity(colours, view.sure.clip(0, CERTAIN) ** 2, near)[colours]
     return np.where(there, cost.clip(0, NEVER), NEVER).astype(np.float32)
 
 

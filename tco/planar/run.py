@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tco.consensus import Agreement, agreed
 from tco.options import ConsensusConfig
-from tco.planar.fit import find, refit
+from tco.planar.fit import faces_along, find, refit
 from tco.planar.frame import Frame, edges, frame_of
 from tco.planar.hinges import hinged
 from tco.planar.label import labelled
@@ -45,12 +45,16 @@ class OnPlanes:
         before: the agreement without planes.
         planes: that were found.
         labels: (V, H, W) 0 where a pixel kept its depth, else the number of its plane, from 1.
+        error: (V, H, W) relative standard error of the plane alone, infinite where there is none.
+        square: of each plane, whether it faces along a direction of the scene.
     """
 
     agreement: Agreement
     before: Agreement
     planes: tuple[Plane, ...]
     labels: Tensor
+    error: Tensor
+    square: tuple[bool, ...]
 
 
 def together(
@@ -101,8 +105,9 @@ def flattened(
     """
     prediction, count = agreement.prediction, len(views)
     chosen = torch.zeros_like(prediction.depth, dtype=torch.int64)
+    of_plane = torch.full_like(prediction.depth, torch.inf)
     if config.planes == 0 or min(views.size) < SMALLEST:
-        return OnPlanes(agreement, agreement, (), chosen)
+        return OnPlanes(agreement, agreement, (), chosen, of_plane, ())
     show = partial(shown, prediction, cameras, views)
     planes = find(map(show, range(count)), count, config, np.random.default_rng(seed))
     stride = min(max(2, math.ceil(math.sqrt(count / SHARED))), min(views.size) // SMALLEST)
@@ -118,18 +123,20 @@ def flattened(
             planes = refit(some, labels, planes, config, frame)
         of_view = partial(_view_on_planes, agreement, show, planes, config, frame)
         results = list(pool.map(of_view, views.wanted))
-    depth, error = prediction.depth.clone(), agreement.error.clone()
-    for i, (flat, spread, label) in zip(views.wanted, results, strict=True):
-        depth[i], error[i], chosen[i] = flat, spread, label
+    depth = prediction.depth.clone()
+    for i, (flat, error, label) in zip(views.wanted, results, strict=True):
+        depth[i], of_plane[i], chosen[i] = flat, error, label
+    error = torch.where(chosen > 0, torch.maximum(agreement.error, of_plane), agreement.error)
     moved = Agreement(replace(prediction, depth=depth), error)
-    return OnPlanes(moved, agreement, tuple(planes), chosen)
+    square = tuple(frame is not None and faces_along(plane, frame) for plane in planes)
+    return OnPlanes(moved, agreement, tuple(planes), chosen, of_plane, square)
 
 
 def _view_on_planes(
     agreement: Agreement, show: Callable[..., Shown], planes: Sequence[Plane], config: ConsensusConfig,
     frame: Frame | None, i: int,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Depth, standard error and labels (H, W) of one view."""
+    """Depth, standard error of the planes and labels (H, W) of one view."""
     view = show(i)
     stride = math.ceil(math.sqrt(view.depth.size / LARGEST))
     label = labelled(view if stride == 1 else show(i, stride), planes, config, frame)
@@ -137,11 +144,12 @@ def _view_on_planes(
         rows, columns = (np.minimum(np.arange(n) // stride, n // stride - 1) for n in view.depth.shape)
         label = label[rows[:, None], columns]
     label = np.where(view.known, label, 0)
-    depth, error = agreement.prediction.depth[i].clone(), agreement.error[i].clone()
+    depth = agreement.prediction.depth[i].clone()
+    error = torch.full_like(depth, torch.inf)
     for k, plane in enumerate(planes):
         there = plane.depth(view)
         on = (label == k + 1) & (there > 0)
         label[(label == k + 1) & ~on] = 0
         depth[on] = torch.from_numpy(there[on]).to(depth)
-        error[on] = torch.maximum(error[on], torch.from_numpy(plane.error(view, there)[on]).to(error))
+        error[on] = torch.from_numpy(plane.error(view, there)[on]).to(error)
     return depth, error, torch.from_numpy(label)

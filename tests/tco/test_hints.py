@@ -14,9 +14,20 @@ from tco.backbones.sweep import Encoded, Sweep
 from tco.backbones.weights import load_sweep
 from tco.consensus import Agreement
 from tco.geometry import project
-from tco.hints import LEAST, UNTRACKED, agreed_points, further_points, joined, reduced, told, with_more
+from tco.hints import (
+    LEAST,
+    UNTRACKED,
+    agreed_points,
+    as_planes_are,
+    further_points,
+    joined,
+    reduced,
+    told,
+    with_more,
+)
 from tco.optimize import optimize
 from tco.options import ConsensusConfig, HintsConfig, TCOConfig
+from tco.planar.run import OnPlanes
 from tco.toy import Toy, Wall, wall
 from tco.types import Prediction, Priors, SparseDepth, Views
 
@@ -93,6 +104,26 @@ def test_only_what_is_known_well_counts(scene: Wall) -> None:
     config = hints(hint_points=10_000, hint_error=0.01, hint_confidence=1.3, hint_distance=0.0)
     for points in agreed_points(what, views, given(scene), config).values():
         assert len(points) == 48 * 16 and int(pixels(points)[1].min()) == 48
+
+
+def test_on_a_plane_its_own_error_counts_and_if_it_is_square_no_confidence(scene: Wall) -> None:
+    """Views 2 % apart and a network that is unsure; a plane known to 0.4 %, over half of the pixels."""
+    labels = torch.zeros(4, 48, 64, dtype=torch.int64)
+    labels[:, :, :16], labels[:, :, 16:32] = 1, 2
+    of_plane = torch.full((4, 48, 64), torch.inf).masked_fill(labels > 0, 0.004)
+    apart = agreement(scene, 0.02, 1.1)
+    flat = OnPlanes(apart, apart, (), labels, of_plane, (False, True))
+    config = hints(hint_points=10_000, hint_error=0.01, hint_confidence=1.3, hint_distance=0.0)
+    assert agreed_points(apart, scene.views, given(scene), config) == {}
+    for points in agreed_points(as_planes_are(flat), scene.views, given(scene), config).values():
+        columns = pixels(points)[1]
+        assert len(points) == 48 * 16 and int(columns.min()) == 16 and int(columns.max()) == 31
+        assert torch.allclose(points.sigma, torch.tensor(0.004))
+    sure = agreement(scene, 0.02, 2.0)
+    flat = OnPlanes(sure, sure, (), labels, of_plane, (False, True))
+    for points in agreed_points(as_planes_are(flat), scene.views, given(scene), config).values():
+        assert len(points) == 48 * 32 and int(pixels(points)[1].max()) == 31
+    assert torch.equal(apart.prediction.confidence, torch.full((4, 48, 64), 1.1))
 
 
 def test_errors_have_a_floor(scene: Wall) -> None:

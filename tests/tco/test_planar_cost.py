@@ -14,7 +14,7 @@ from tco.consensus import Agreement
 from tco.options import ConsensusConfig
 from tco.planar import run
 from tco.planar.fit import refit
-from tco.planar.label import MOST_UNLIKE, NEVER, UNLIKE, colour_bins, cost_of
+from tco.planar.label import CERTAIN, MOST_UNLIKE, NEVER, UNLIKE, colour_bins, cost_of
 from tco.planar.view import Floats, Plane, Shown, shown
 from tco.toy import Wall, wall
 from tco.types import Prediction
@@ -30,11 +30,12 @@ def scene() -> Wall:
     return wall(6, (96, 128), SLOPE)
 
 
-def seen(scene: Wall, depth: Tensor) -> list[Shown]:
-    """The views with these depths, of confidence 6."""
+def seen(scene: Wall, depth: Tensor, confidence: Tensor | None = None) -> list[Shown]:
+    """The views with these depths, of confidence 6 unless another is given."""
     cameras = scene.priors.cameras
     assert cameras is not None
-    prediction = Prediction(depth, torch.full_like(depth, 6.0), cameras, tuple(range(len(depth))))
+    sure = torch.full_like(depth, 6.0) if confidence is None else confidence
+    prediction = Prediction(depth, sure, cameras, tuple(range(len(depth))))
     return [shown(prediction, cameras, scene.views, i) for i in range(len(depth))]
 
 
@@ -69,6 +70,20 @@ def test_a_colour_that_the_plane_does_not_show_costs(scene: Wall) -> None:
     found = cost(replace(view, image=image))
     assert found[45, 75] - found[45, 50] > 0.5 * UNLIKE * MOST_UNLIKE
     assert found[45, 75] - found[45, 50] <= UNLIKE * MOST_UNLIKE + 0.1
+
+
+def test_pixels_count_for_the_colours_of_a_plane_with_the_square_of_their_confidence(scene: Wall) -> None:
+    """30 rows of a red patch are at the wall's depth, by unsure pixels; 20 are behind it, by sure ones."""
+    sure, depth = torch.full_like(scene.depth, 4.0), scene.depth.clone()
+    sure[2, 30:60, 40:80], depth[2, 60:80, 40:80] = 1.5, 1.3 * depth[2, 60:80, 40:80]
+    view = plain(seen(scene, depth, sure)[2])
+    image = view.image.copy()
+    image[30:80, 40:80] = (0.9, 0.1, 0.1)
+    here, behind = 30 * 40 * 0.5**2, 20 * 40 * CERTAIN**2
+    grey = (96 * 128 - 50 * 40) * CERTAIN**2
+    on_it, anywhere = here / (here + grey), (here + behind) / (here + behind + grey)
+    found = cost(replace(view, image=image))
+    assert found[45, 60] == pytest.approx(UNLIKE * math.log(anywhere / on_it), rel=0.1)
 
 
 def test_where_there_is_no_depth_the_plane_cannot_be(scene: Wall) -> None:
