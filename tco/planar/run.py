@@ -28,7 +28,8 @@ SHARED = 3.0
 more than half of it. In the end all are labelled at their own."""
 LARGEST = 200_000
 """Pixels at most that are labelled at once; labels of larger views are coarser, their depths are not. This
-bounds memory, at 1 kB a pixel and thread for 20 planes, and time."""
+bounds memory, at 1 kB a pixel and thread for 20 planes, and time. While planes are chosen from about twice as
+many, those that are put up among them, it is half of that."""
 WORKERS = 8
 """Threads at most."""
 SMALLEST = 16
@@ -110,7 +111,9 @@ def flattened(
         return OnPlanes(agreement, agreement, (), chosen, of_plane, ())
     show = partial(shown, prediction, cameras, views)
     planes = find(map(show, range(count)), count, config, np.random.default_rng(seed))
-    stride = min(max(2, math.ceil(math.sqrt(count / SHARED))), min(views.size) // SMALLEST)
+    shared = math.ceil(math.sqrt(count / SHARED))
+    bound = math.ceil(math.sqrt(math.prod(views.size) / (LARGEST / 2)))
+    stride = min(max(2, shared, bound), min(views.size) // SMALLEST)
     some = [show(i, stride) for i in range(count)]
     frame = None
     if config.plane_square > 0:
