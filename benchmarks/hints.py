@@ -11,7 +11,9 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from operator import attrgetter
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from torch import Tensor
@@ -76,6 +78,9 @@ def rows(networks: tuple[Sweep, Sweep], case: Case) -> Iterator[tuple[str, Share
     of = predicted(equalised, told)
     yield "equalised, told", of(changed(told, polish_growth=0.0))
     yield "default: equalised, told, taken back", of(told)
+    with patch("tco.hints.as_planes_are", attrgetter("agreement")):
+        of = predicted(equalised, told)
+    yield "the same, told of pixels on planes as of others", of(told)
     unoptimised = replace(told, steps=0)
     yield "default without optimisation", predicted(equalised, unoptimised)(unoptimised)
 

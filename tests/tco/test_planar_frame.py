@@ -363,3 +363,18 @@ def test_a_plain_front_stands_upright(turn: tuple[float, float, float]) -> None:
     assert float((before < 0.05).float().mean()) < 0.5
     assert right(replace(CONFIG, plane_square=3.0)) > 0.9
     assert right(replace(CONFIG, plane_square=0.0)) < 0.6
+
+
+def test_planes_are_known_by_whether_they_face_along_a_direction() -> None:
+    """The right wall is slanted by 30°, the others are not; without directions none does."""
+    slanted = room(slant=math.radians(30))
+    given = slanted.agreement(slanted.depth)
+    flat = flattened(given, slanted.cameras, slanted.views, CONFIG)
+    astray = [degrees_off(plane.normal[None], slanted.axes) for plane in flat.planes]
+    assert flat.square == tuple(degrees < 10 for degrees in astray)
+    assert set(flat.square) == {False, True}
+    on = flat.labels > 0
+    assert torch.equal(flat.error.isfinite(), on)
+    assert float(flat.error[on].median()) < 0.005
+    none = flattened(given, slanted.cameras, slanted.views, replace(CONFIG, plane_square=0.0))
+    assert len(none.planes) > 1 and not any(none.square)
