@@ -232,7 +232,7 @@ MUTATIONS = [
     ),
     *_of(
         "tco/hints.py",
-        "hints",
+        "hints planar_frame",
         ("(error[i] < c.hint_error)", "(error[i] < 1)"),
         ("confidence[i] >= c.hint_confidence", "confidence[i] >= 0"),
         ("distance_transform_edt(free) >= distance", "distance_transform_edt(free) < distance"),

@@ -102,7 +102,9 @@ def test_only_what_is_known_well_counts(scene: Wall) -> None:
     what = replace(what, prediction=replace(what.prediction, depth=depth))
     views = replace(scene.views, valid=valid)
     config = hints(hint_points=10_000, hint_error=0.01, hint_confidence=1.3, hint_distance=0.0)
-    for points in agreed_points(what, views, given(scene), config).values():
+    found = agreed_points(what, views, given(scene), config)
+    assert list(found) == [0, 1, 2, 3]
+    for points in found.values():
         assert len(points) == 48 * 16 and int(pixels(points)[1].min()) == 48
 
 
@@ -115,19 +117,25 @@ def test_on_a_plane_its_own_error_counts_and_if_it_is_square_no_confidence(scene
     flat = OnPlanes(apart, apart, (), labels, of_plane, (False, True))
     config = hints(hint_points=10_000, hint_error=0.01, hint_confidence=1.3, hint_distance=0.0)
     assert agreed_points(apart, scene.views, given(scene), config) == {}
-    for points in agreed_points(as_planes_are(flat), scene.views, given(scene), config).values():
+    found = agreed_points(as_planes_are(flat), scene.views, given(scene), config)
+    assert list(found) == [0, 1, 2, 3]
+    for points in found.values():
         columns = pixels(points)[1]
         assert len(points) == 48 * 16 and int(columns.min()) == 16 and int(columns.max()) == 31
         assert torch.allclose(points.sigma, torch.tensor(0.004))
     sure = agreement(scene, 0.02, 2.0)
     flat = OnPlanes(sure, sure, (), labels, of_plane, (False, True))
-    for points in agreed_points(as_planes_are(flat), scene.views, given(scene), config).values():
+    found = agreed_points(as_planes_are(flat), scene.views, given(scene), config)
+    assert list(found) == [0, 1, 2, 3]
+    for points in found.values():
         assert len(points) == 48 * 32 and int(pixels(points)[1].max()) == 31
     assert torch.equal(apart.prediction.confidence, torch.full((4, 48, 64), 1.1))
 
 
 def test_errors_have_a_floor(scene: Wall) -> None:
-    for points in agreed_points(agreement(scene, 1e-6), scene.views, given(scene), PLAIN).values():
+    found = agreed_points(agreement(scene, 1e-6), scene.views, given(scene), PLAIN)
+    assert list(found) == [0, 1, 2, 3]
+    for points in found.values():
         assert torch.allclose(points.sigma, torch.tensor(LEAST))
 
 
@@ -135,7 +143,9 @@ def test_errors_have_a_floor(scene: Wall) -> None:
 def test_points_keep_their_distance_from_colmaps(scene: Wall, distance: float) -> None:
     config, known = hints(hint_points=10_000, hint_distance=distance), given(scene)
     far = distance * 64
-    for i, points in agreed_points(agreement(scene), scene.views, known, config).items():
+    found = agreed_points(agreement(scene), scene.views, known, config)
+    assert list(found) == [0, 1, 2, 3]
+    for i, points in found.items():
         place = known[i].xy.floor() + 0.5
         assert float(torch.cdist(points.xy, place).min()) >= far - 1e-4
         rows, columns = torch.meshgrid(torch.arange(48), torch.arange(64), indexing="ij")

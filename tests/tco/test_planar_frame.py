@@ -12,14 +12,15 @@ from torch import Tensor
 
 from tco.consensus import Agreement
 from tco.geometry import pixel_grid, rays, rigid, so3_exp
-from tco.options import ConsensusConfig
+from tco.hints import further_points
+from tco.options import ConsensusConfig, TCOConfig
 from tco.planar.fit import ALIKE, find, refit
 from tco.planar.frame import Frame, by_edges, by_normals, edges, frame_of, turned
 from tco.planar.hinges import LEAN, WIDTH, hinged, nearest_along
 from tco.planar.label import ASKEW, DOUBTFUL, FREE, KEPT, cost_of_facing, cost_of_keeping
 from tco.planar.run import flattened
 from tco.planar.view import ERROR, Floats, Plane, Shown, guessed, shown
-from tco.types import Cameras, Prediction, Views
+from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
 
 CONFIG = ConsensusConfig()
 SIZE = (120, 160)
@@ -378,3 +379,23 @@ def test_planes_are_known_by_whether_they_face_along_a_direction() -> None:
     assert float(flat.error[on].median()) < 0.005
     none = flattened(given, slanted.cameras, slanted.views, replace(CONFIG, plane_square=0.0))
     assert len(none.planes) > 1 and not any(none.square)
+
+
+@pytest.mark.parametrize("square", [0.0, 3.0])
+def test_the_network_is_told_where_the_plain_front_is(scene: Room, square: float) -> None:
+    """It is unsure of the front, which leans: it is told of pixels there only on a plane at right angles."""
+    count = len(scene.depth)
+    nothing = SparseDepth(*(torch.zeros(shape) for shape in ((0, 2), 0, 0)), torch.zeros(0).long())
+    priors = Priors(scene.cameras, (nothing,) * count, overlap=9.0 * (1 - torch.eye(count)))
+    config = TCOConfig(consensus=replace(CONFIG, plane_square=square))
+    prediction = scene.agreement(scene.guess(), doubt=0.4).prediction
+    depths, right = 0, 0
+    for i, points in further_points(prediction, scene.views, priors, config).items():
+        columns, rows = points.xy.long().unbind(1)
+        there = scene.front[i, rows, columns]
+        off = (points.depth / scene.depth[i, rows, columns] - 1).abs()[there]
+        depths, right = depths + len(off), right + int((off < 0.05).sum())
+    if square:
+        assert depths > 100 and right > 0.9 * depths
+    else:
+        assert depths == 0
