@@ -1,10 +1,35 @@
-"""The depths of all views that steps compare with: when they are too old, and how new ones are put in."""
+"""The depths of all views that steps compare with: the first ones, and when and how new ones replace them."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
-from tco.types import Prediction
+import torch
+import torch.nn.functional as F
+
+from tco.backbones.base import Backbone, Drafts
+from tco.types import Cameras, Prediction
+
+
+def first_word(backbone: Backbone, encoded: Any) -> Prediction:
+    """What the network says of all views at first, at a part of the resolution if it can: it is not kept."""
+    return backbone.draft(encoded) if isinstance(backbone, Drafts) else backbone.decode(encoded)
+
+
+def enlarged(prediction: Prediction, size: tuple[int, int]) -> Prediction:
+    """A prediction for maps of ``size`` (H, W), a whole number of times its own, by bilinear interpolation.
+
+    Inverse depths are interpolated, which are linear on planes; so are confidences.
+    """
+    factor = size[1] // prediction.depth.shape[-1]
+    if factor == 1:
+        return prediction
+    maps = torch.stack([1 / prediction.depth, prediction.confidence], 1)
+    inverse, confidence = F.interpolate(maps, scale_factor=float(factor), mode="bilinear").unbind(1)
+    scale = prediction.cameras.K.new_tensor([factor, factor, 1])
+    cameras = Cameras(prediction.cameras.world_from_cam, prediction.cameras.K * scale[:, None])
+    return replace(prediction, depth=1 / inverse, confidence=confidence, cameras=cameras)
 
 
 def due(number: int, every: int) -> bool:

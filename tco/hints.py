@@ -5,7 +5,7 @@ and where there are none, on plain walls and floors, it is on its own. Yet many 
 and by several views alike. So the network is asked twice. What it says first goes through the consensus of
 the views and onto their planes (:mod:`tco.planar`); of the pixels whose depths are then known well and that
 are far from any point, some are drawn and given to it with the points, and it is asked again. Matches are not
-looked for anew, so that this costs a decoding.
+looked for anew, so that this costs a decoding, at a part of the resolution if the network can.
 
 They are input alone: no penalty holds depths to them, since they are the network's own word.
 """
@@ -22,8 +22,9 @@ import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from tco.backbones.base import Backbone, Drafts
+from tco.backbones.base import Backbone
 from tco.consensus import Agreement
+from tco.context import first_word
 from tco.options import TCOConfig
 from tco.planar.run import OnPlanes, together
 from tco.polish import displacement
@@ -40,8 +41,8 @@ UNTRACKED = -1
 @torch.no_grad()
 def told(
     backbone: Backbone, encoded: Any, views: Views, priors: Priors, config: TCOConfig, seed: int = 0
-) -> tuple[Any, Prediction, dict[int, SparseDepth]]:
-    """The network's features with what the views agree on as further points, and what it says then.
+) -> tuple[Any, Prediction | None, dict[int, SparseDepth]]:
+    """The network's features with what the views agree on as further points.
 
     Args:
         backbone: the network, not adapted.
@@ -52,21 +53,21 @@ def told(
         seed: of what is drawn.
 
     Returns:
-        Features; the prediction of all views with them; and the further points of each view that has some.
-        Where the network takes no points, views are few, cameras are uncertain, or no view has any pixel that
-        is agreed on: ``encoded`` itself, what the network says at first, and none.
+        Features; what the network said that was asked last, of all views, perhaps at a part of the
+        resolution; and the further points of each view that has some. Where no view has any pixel that is
+        agreed on: ``encoded`` itself, and none. Where the network takes no points, views are few, or cameras
+        are uncertain, it is not asked, and None is what it said.
     """
-    points, now, prediction = dict[int, SparseDepth](), encoded, None
+    points, now, said = dict[int, SparseDepth](), encoded, None
     rounds = config.hints.hint_rounds if _can_be_told(backbone, encoded, views, priors, config) else 0
     for _ in range(rounds):
-        said = prediction or _first_word(backbone, encoded)
+        said = first_word(backbone, encoded) if said is None else backbone.decode(now)
         found = further_points(said, views, priors, config, seed)
         if not found:
             break
         assert priors.sparse is not None
         points, now = found, with_more(backbone, encoded, priors.sparse, found)
-        prediction = backbone.decode(now)
-    return now, prediction or backbone.decode(now), points
+    return now, said, points
 
 
 def _can_be_told(backbone: Backbone, encoded: Any, views: Views, priors: Priors, config: TCOConfig) -> bool:
@@ -77,11 +78,6 @@ def _can_be_told(backbone: Backbone, encoded: Any, views: Views, priors: Priors,
     if not backbone.uses_cameras or len(views) < FEWEST_VIEWS or uncertain:
         return False
     return backbone.with_points(encoded, {0: priors.sparse[0]}) is not encoded
-
-
-def _first_word(backbone: Backbone, encoded: Any) -> Prediction:
-    """What the network says at first, at a part of the resolution if it can: it is not what is returned."""
-    return backbone.draft(encoded) if isinstance(backbone, Drafts) else backbone.decode(encoded)
 
 
 def further_points(

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tco.adam import Adam
 from tco.backbones.base import Backbone, RunsAhead
-from tco.context import detached, due, merged
+from tco.context import detached, due, enlarged, first_word, merged
 from tco.corrections import CameraCorrections
 from tco.free import FreePixels
 from tco.hints import joined, told, with_more
@@ -39,7 +39,7 @@ class Outcome:
     """What optimisation gives.
 
     Attributes:
-        prediction: of all views; those that only help (``Views.helpers``) as the steps knew them.
+        prediction: of all views.
         cameras: of all views, with their corrections.
         corrections: how far each camera went (``CameraCorrections.sizes``); empty if none could move.
         history: the named terms of every step, unweighted, and their weighted sum as ``loss``; first the
@@ -113,11 +113,13 @@ def optimize(
     """
     config = config or TCOConfig()
     with torch.no_grad():
-        encoded, first, points = told(backbone, backbone.encode(views, priors), views, priors, config, seed)
-    if config.steps == 0:
-        return Outcome(first, first.cameras, told=points)
+        encoded, said, points = told(backbone, backbone.encode(views, priors), views, priors, config, seed)
+        if config.steps == 0:
+            prediction = backbone.decode(encoded)
+            return Outcome(prediction, prediction.cameras, told=points)
+        context = enlarged(said or first_word(backbone, encoded), views.size)
     terms, generator = Terms(views, priors, config, extra), torch.Generator().manual_seed(seed)
-    run = _Run(backbone, views, priors, terms, encoded, first, generator)
+    run = _Run(backbone, views, priors, terms, encoded, context, generator)
     run.watched, run.told = watched, points
     with run.adapters() as parameters:
         run.prepare(parameters)
@@ -337,15 +339,14 @@ class _Run:
             self.context = merged(self.context, self._decode(self.encoded, context=self.context))
 
     @torch.no_grad()
-    def _reencode(self) -> bool:
-        """Give the network the corrected cameras if they went far since it was given any; True if so."""
+    def _reencode(self) -> None:
+        """Give the network the corrected cameras if they went far since it was given any."""
         if self.corrections is None or not self._moved(self.corrections):
-            return False
+            return
         self.encoded_cameras = self.corrections()
         priors = replace(self.priors, cameras=self.encoded_cameras)
         encoded = self.backbone.encode(self.views, priors)
         self.encoded = self._ahead(with_more(self.backbone, encoded, self.terms.sparse, self.told))
-        return True
 
     def _moved(self, corrections: CameraCorrections) -> bool:
         """Whether the network should be given the corrected cameras."""
@@ -357,24 +358,17 @@ class _Run:
     def outcome(self) -> Outcome:
         """Predict all views with the adapted network, as the best step had it if the last ruined it."""
         with torch.no_grad():
-            anew = self._reencode()
-            prediction = self._last(anew)
+            self._reencode()
+            prediction = self._decode(self.encoded, context=self.context)
             if not bool(torch.isfinite(prediction.depth).all()):
                 logger.warning("the last step gave depths that are not finite; back to the best state")
                 self._roll_back(self.config.steps)
-                prediction = self._last(anew)
+                prediction = self._decode(self.encoded, context=self.context)
             cameras = self.cameras(prediction)
         cameras = Cameras(cameras.world_from_cam.detach(), cameras.K.detach())
         prediction = detached(prediction)
         sizes = {} if self.corrections is None else self.corrections.sizes()
         return Outcome(prediction, cameras, sizes, self.history, tuple(self.rolled_back), told=self.told)
-
-    def _last(self, anew: bool) -> Prediction:
-        """All views by the network as it is now; helpers as they were, unless they were encoded ``anew``."""
-        if anew or not self.views.helpers:
-            return self._decode(self.encoded, context=self.context)
-        part = self._decode(self.encoded, list(self.views.wanted), self.context)
-        return merged(self.context, part)
 
     def polished(self, outcome: Outcome, report: Report | None) -> Outcome:
         """The outcome with its depths refined, if that is wanted; where cameras are sought it is not."""

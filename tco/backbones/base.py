@@ -73,6 +73,7 @@ class Drafts(Protocol):
     def draft(self, encoded: Any) -> Prediction:
         """Depths and confidences of all views, and the cameras of maps of that size.
 
-        Height and width are those of the canvas divided by one whole number.
+        Height and width are those of the canvas divided by one whole number. Its ``stages`` are such as
+        ``decode`` finds in a context.
         """
         ...

@@ -227,15 +227,18 @@ class Sweep(nn.Module):
 
     def draft(self, encoded: Encoded) -> Prediction:
         """All views without the last pass, which is what doubles the resolution."""
-        every = range(len(encoded.lo))
-        stage = self.coarse(encoded, every)
-        for k in range(len(self.config.spacing) - 1):
+        every, passes = range(len(encoded.lo)), len(self.config.spacing)
+        stage, kept = self.coarse(encoded, every), []
+        for k in range(passes):
             world = stage.detached() if k else stage.detached().doubled()
-            stage = self.refine(k, encoded, every, stage, world)
+            kept.append(torch.stack([world.inverse, world.log_error], 1))
+            if k < passes - 1:
+                stage = self.refine(k, encoded, every, stage, world)
         factor = 2 * encoded.fine.shape[-1] // stage.inverse.shape[-1]
         scale = encoded.cameras.K.new_tensor([1 / factor, 1 / factor, 1])
         cameras = Cameras(encoded.cameras.world_from_cam, encoded.cameras.K * scale[:, None])
-        return Prediction(1 / stage.inverse, expected_confidence(stage.log_error), cameras, tuple(every))
+        confidence = expected_confidence(stage.log_error)
+        return Prediction(1 / stage.inverse, confidence, cameras, tuple(every), tuple(kept))
 
     def _worlds(
         self, encoded: Encoded, chosen: tuple[int, ...], stage: Stage, context: Prediction | None

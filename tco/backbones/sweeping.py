@@ -137,7 +137,9 @@ def interpolate_points(
 def nearest_points(places: Tensor, xy: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Distances, the least first, and indices (N, count) of the points (M, 2) nearest to places (N, 2)."""
     if places.device.type == "cpu":
-        distance, index = KDTree(xy.numpy()).query(places.numpy(), list(range(1, count + 1)))
+        distance, index = KDTree(xy.numpy()).query(
+            places.numpy(), list(range(1, count + 1)), workers=torch.get_num_threads()
+        )
         return torch.from_numpy(distance).to(places), torch.from_numpy(index)
     exact = "donot_use_mm_for_euclid_dist"
     parts = [

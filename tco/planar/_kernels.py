@@ -22,57 +22,64 @@ Labels = NDArray[np.int64]
 
 
 @njit(nogil=True, cache=True, inline="always")
-def step_cost(one: int, other: int, logs: Floats, others: Floats, tau: float, kappa: float) -> float:
-    """Cost of two neighbours' labels, for a weight of one, by their logarithms of depth (K,) each."""
+def step_cost(one: int, other: int, log: float, other_log: float, kappa: float) -> float:
+    """Cost of two neighbours' labels, for a weight of one, by the logarithms of depth they give, over τ."""
     if one == other and one > 0:
         return 0.0
-    step = min(1.0, abs(logs[one] - others[other]) / tau)
+    step = min(1.0, abs(log - other_log))
     return step if one == other else step + kappa
 
 
 @njit(nogil=True, cache=True)
 def _send(
-    mine: Floats, back: Floats, logs: Floats, others: Floats, terms: tuple[float, float, float], out: Floats
-) -> None:
-    """Message (K,) from a pixel to its neighbour into ``out``, its least entry zero.
+    mine: Floats, messages: Floats, logs: Floats, here: tuple[int, int, int], there: tuple[int, int, int],
+    terms: tuple[float, float], best: Floats,
+) -> None:  # fmt: skip
+    """Message (K,) from a pixel to its neighbour, its least entry zero.
 
     Args:
         mine: (K,) the pixel's share of its costs and of all messages to it.
-        back: (K,) the message that came from that neighbour.
-        logs, others: (K,) of the pixel and of the neighbour.
-        terms: weight, τ and κ.
-        out: where the message goes.
+        messages: (4, H, W, K); see :func:`_pass_on`.
+        logs: (H, W, K), over τ.
+        here: which message came from that neighbour, and row and column of the pixel.
+        there: which message goes to the neighbour, and its row and column.
+        terms: weight and κ.
+        best: (K,) room.
     """
-    weight, tau, kappa = terms
+    weight, kappa = terms
+    back, y, x = here
+    to, v, u = there
+    labels = len(mine)
     cheapest = np.float32(np.inf)
-    for k in range(len(mine)):
-        cheapest = min(cheapest, mine[k] - back[k])
-    most = np.float32(cheapest + weight * (1 + kappa))  # whatever the two labels, a border costs no more
+    for j in range(labels):
+        cheapest = min(cheapest, mine[j] - messages[back, y, x, j])
+    most = cheapest + weight * (1 + kappa)  # whatever the two labels, a border costs no more
+    for k in range(labels):
+        best[k] = most
+    for j in range(labels):
+        own = mine[j] - messages[back, y, x, j]
+        if own < most:
+            log, dearer = logs[y, x, j], own + weight * kappa
+            for k in range(labels):
+                best[k] = min(best[k], dearer + weight * min(np.float32(1), abs(log - logs[v, u, k])))
+            best[j] = min(best[j], own + weight * step_cost(j, j, log, logs[v, u, j], kappa))
     least = np.float32(np.inf)
-    for k in range(len(mine)):
-        best = most
-        for j in range(len(mine)):
-            own = mine[j] - back[j]
-            if own < best:
-                best = min(best, own + weight * step_cost(j, k, logs, others, tau, kappa))
-        out[k] = best
-        least = min(least, best)
-    for k in range(len(mine)):
-        out[k] -= least
+    for k in range(labels):
+        least = min(least, best[k])
+    for k in range(labels):
+        messages[to, v, u, k] = best[k] - least
 
 
 @njit(nogil=True, cache=True)
 def _pass_on(
-    unary: Floats, logs: Floats, right: Floats, down: Floats, terms: tuple[float, float], messages: Floats,
-    forth: bool,
-) -> None:  # fmt: skip
+    unary: Floats, logs: Floats, right: Floats, down: Floats, kappa: float, messages: Floats, forth: bool
+) -> None:
     """One pass over all pixels, from the first to the last or back, of the messages (4, H, W, K).
 
     Message 0 comes from the left, 1 from the right, 2 from above, 3 from below.
     """
     h, w, labels = unary.shape
-    tau, kappa = terms
-    mine = np.empty(labels, np.float32)
+    mine, room = np.empty(labels, np.float32), np.empty(labels, np.float32)
     for step in range(h * w):
         y, x = divmod(step if forth else h * w - 1 - step, w)
         before, after = (x > 0) + (y > 0), (x + 1 < w) + (y + 1 < h)
@@ -80,19 +87,14 @@ def _pass_on(
         for k in range(labels):
             sent = messages[0, y, x, k] + messages[1, y, x, k] + messages[2, y, x, k] + messages[3, y, x, k]
             mine[k] = share * (unary[y, x, k] + sent)
-        here = logs[y, x]
         if forth and x + 1 < w:
-            to, known = messages[0, y, x + 1], messages[1, y, x]
-            _send(mine, known, here, logs[y, x + 1], (right[y, x], tau, kappa), to)
+            _send(mine, messages, logs, (1, y, x), (0, y, x + 1), (right[y, x], kappa), room)
         if forth and y + 1 < h:
-            to, known = messages[2, y + 1, x], messages[3, y, x]
-            _send(mine, known, here, logs[y + 1, x], (down[y, x], tau, kappa), to)
+            _send(mine, messages, logs, (3, y, x), (2, y + 1, x), (down[y, x], kappa), room)
         if not forth and x > 0:
-            to, known = messages[1, y, x - 1], messages[0, y, x]
-            _send(mine, known, here, logs[y, x - 1], (right[y, x - 1], tau, kappa), to)
+            _send(mine, messages, logs, (0, y, x), (1, y, x - 1), (right[y, x - 1], kappa), room)
         if not forth and y > 0:
-            to, known = messages[3, y - 1, x], messages[2, y, x]
-            _send(mine, known, here, logs[y - 1, x], (down[y - 1, x], tau, kappa), to)
+            _send(mine, messages, logs, (2, y, x), (3, y - 1, x), (down[y - 1, x], kappa), room)
 
 
 @njit(nogil=True, cache=True)
@@ -110,11 +112,11 @@ def least_labels(
         sweeps: passes there and back.
     """
     h, w, labels = unary.shape
-    tau, kappa = terms
+    logs, kappa = logs / np.float32(terms[0]), np.float32(terms[1])
     messages = np.zeros((4, h, w, labels), np.float32)
     for _ in range(sweeps):
-        _pass_on(unary, logs, right, down, terms, messages, True)
-        _pass_on(unary, logs, right, down, terms, messages, False)
+        _pass_on(unary, logs, right, down, kappa, messages, True)
+        _pass_on(unary, logs, right, down, kappa, messages, False)
     found = np.zeros((h, w), np.int64)
     for y in range(h):
         for x in range(w):
@@ -123,10 +125,10 @@ def least_labels(
                 cost = unary[y, x, k] + messages[1, y, x, k] + messages[3, y, x, k]
                 if x > 0:
                     j = found[y, x - 1]
-                    cost += right[y, x - 1] * step_cost(j, k, logs[y, x - 1], logs[y, x], tau, kappa)
+                    cost += right[y, x - 1] * step_cost(j, k, logs[y, x - 1, j], logs[y, x, k], kappa)
                 if y > 0:
                     j = found[y - 1, x]
-                    cost += down[y - 1, x] * step_cost(j, k, logs[y - 1, x], logs[y, x], tau, kappa)
+                    cost += down[y - 1, x] * step_cost(j, k, logs[y - 1, x, j], logs[y, x, k], kappa)
                 if cost < best:
                     best, found[y, x] = cost, k
     return found

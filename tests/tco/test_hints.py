@@ -191,7 +191,7 @@ def test_the_network_is_told_of_what_is_right(network: Sweep, rendered: tuple[Vi
     few = replace(priors, sparse=tuple(points[::8] for points in priors.sparse))
     with torch.no_grad():
         start = network.encode(views, few)
-    now, second, points = told(network, start, views, few, PLAIN)
+    now, said, points = told(network, start, views, few, PLAIN)
     assert sum(map(len, points.values())) > 200
     pairs = [(p.depth, truth[i][p.xy[:, 1].long(), p.xy[:, 0].long()]) for i, p in points.items()]
     depth, true = (torch.cat(part) for part in zip(*pairs, strict=True))
@@ -199,19 +199,16 @@ def test_the_network_is_told_of_what_is_right(network: Sweep, rendered: tuple[Vi
     assert float((error < 0.02).float().mean()) > 0.8
     with torch.no_grad():
         again = network.decode(with_more(network, start, few.sparse or (), points))
-    assert torch.equal(again.depth, second.depth) and torch.equal(
-        network.decode(now).depth.detach(), second.depth
-    )
+        assert torch.equal(again.depth, network.decode(now).depth)
+        assert said is not None and torch.equal(said.depth, network.draft(start).depth)
 
 
 @pytest.mark.usefixtures("few_views")
 def test_no_round_is_the_network_alone(
     network: Sweep, encoded: Encoded, rendered: tuple[Views, Priors, Tensor]
 ) -> None:
-    now, prediction, points = told(network, encoded, *rendered[:2], hints(hint_rounds=0))
-    with torch.no_grad():
-        plain = network.decode(encoded)
-    assert now is encoded and points == {} and torch.equal(prediction.depth, plain.depth)
+    now, said, points = told(network, encoded, *rendered[:2], hints(hint_rounds=0))
+    assert now is encoded and points == {} and said is None
 
 
 def test_few_views_are_asked_once(
@@ -253,7 +250,9 @@ def test_a_network_that_takes_no_points_is_asked_once(scene: Wall) -> None:
     toy = Counting()
     features = toy.encode(scene.views, scene.priors)
     now, _, points = told(toy, features, scene.views, scene.priors, PLAIN)
-    assert now is features and points == {} and toy.decoded == 1
+    assert now is features and points == {} and toy.decoded == 0
+    optimize(toy, scene.views, scene.priors, replace(PLAIN, steps=0))
+    assert toy.decoded == 1
 
 
 @pytest.mark.usefixtures("few_views")
@@ -268,12 +267,12 @@ def test_a_round_that_finds_nothing_keeps_what_the_one_before_found(
         return agreed_points(what, *args) if len(asked) == 1 else {}
 
     monkeypatch.setattr("tco.hints.agreed_points", first_time_alone)
-    now, prediction, points = told(network, encoded, *rendered[:2], hints(hint_rounds=2))
-    assert (
-        len(asked) == 2 and points.keys() == once[2].keys() and torch.equal(prediction.depth, once[1].depth)
-    )
+    now, said, points = told(network, encoded, *rendered[:2], hints(hint_rounds=2))
+    assert len(asked) == 2 and points.keys() == once[2].keys()
     with torch.no_grad():
-        assert torch.equal(network.decode(now).depth, prediction.depth)
+        second = network.decode(once[0])
+        assert said is not None and torch.equal(said.depth, second.depth)
+        assert torch.equal(network.decode(now).depth, second.depth)
 
 
 @pytest.mark.usefixtures("few_views")
@@ -281,12 +280,10 @@ def test_helpers_are_not_told_of(
     network: Sweep, encoded: Encoded, rendered: tuple[Views, Priors, Tensor]
 ) -> None:
     views, priors, _ = rendered
-    now, prediction, points = told(network, encoded, replace(views, helpers=2), priors, PLAIN)
+    now, _, points = told(network, encoded, replace(views, helpers=2), priors, PLAIN)
     assert set(points) <= {0, 1, 2} and points
     assert torch.equal(now.hints[0].nearest[3:], encoded.hints[0].nearest[3:])
     assert not torch.equal(now.hints[0].nearest[:3], encoded.hints[0].nearest[:3])
-    with torch.no_grad():
-        assert torch.equal(prediction.depth, network.decode(now).depth)
 
 
 def test_a_draft_is_what_the_network_says_at_half_the_resolution(
@@ -304,6 +301,8 @@ def test_a_draft_is_what_the_network_says_at_half_the_resolution(
     halves, places = (project(points, p.cameras.K)[0] for p in (draft, whole))
     torch.testing.assert_close(halves, places / 2)
     assert torch.equal(draft.cameras.world_from_cam, whole.cameras.world_from_cam)
+    assert len(draft.stages) == len(whole.stages) > 0
+    assert all(torch.equal(a, b) for a, b in zip(draft.stages, whole.stages, strict=True))
 
 
 def test_points_of_a_draft_are_where_they_are_in_the_whole(
@@ -355,12 +354,43 @@ def test_optimisation_starts_from_what_it_was_told(
 ) -> None:
     """Without steps the prediction is the told one; steps of no size on the network lead back to it."""
     views, priors, _ = rendered
-    _, prediction, points = told(network, encoded, views, priors, PLAIN)
+    now, _, points = told(network, encoded, views, priors, PLAIN)
+    with torch.no_grad():
+        depth = network.decode(now).depth
     outcome = optimize(network, views, priors, PLAIN)
-    assert torch.equal(outcome.prediction.depth, prediction.depth) and outcome.told.keys() == points.keys()
+    assert torch.equal(outcome.prediction.depth, depth) and outcome.told.keys() == points.keys()
     still = replace(PLAIN, steps=2, rate=0.0, camera_rate=0.0)
     still = replace(still, polish=replace(still.polish, polish_looks=0))
-    assert torch.equal(optimize(network, views, priors, still).prediction.depth, prediction.depth)
+    assert torch.equal(optimize(network, views, priors, still).prediction.depth, depth)
+
+
+@pytest.mark.usefixtures("few_views")
+@pytest.mark.parametrize("views_asked", [5, 9], ids=["told", "not told"])
+def test_steps_compare_with_a_draft(
+    rendered: tuple[Views, Priors, Tensor], views_asked: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One is made, of which the network is told as well; all views are decoded once, in the end."""
+
+    class Counting(Sweep):
+        drafts, wholes = 0, 0
+
+        def draft(self, encoded: Encoded) -> Prediction:
+            self.drafts += 1
+            return super().draft(encoded)
+
+        def decode(
+            self, encoded: Encoded, views: Any = None, context: Prediction | None = None
+        ) -> Prediction:
+            self.wholes += views is None
+            assert context is not None and context.depth.shape[-2:] == rendered[0].size
+            return super().decode(encoded, views, context)
+
+    monkeypatch.setattr("tco.hints.FEWEST_VIEWS", views_asked)
+    network = Counting()
+    network.load_state_dict(load_sweep().state_dict())
+    config = replace(PLAIN, steps=1, camera_rate=0.0, polish=replace(PLAIN.polish, polish_looks=0))
+    outcome = optimize(network, *rendered[:2], config)
+    assert bool(outcome.told) is (views_asked == 5) and (network.drafts, network.wholes) == (1, 1)
 
 
 def test_what_is_told_comes_beside_what_was_given(
