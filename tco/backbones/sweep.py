@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from tco.backbones.contrast import equalised
 from tco.backbones.decoder import Decoder, SweepConfig, convex_upsample, soft_argmax
+from tco.backbones.fusing import Fusing
 from tco.backbones.layers import FeatureNet
 from tco.backbones.sweeping import BACKGROUND, Hints, interpolate_points, inverse_range, relative_cameras
 from tco.backbones.transformer import compute_dtype, computing
@@ -191,17 +192,11 @@ class Sweep(nn.Module):
         """
         relative = relative_cameras(cameras, views, sources, 4)
         reference = torch.as_tensor(list(views), device=sources.device)
-        total = weights = torch.zeros((), device=features.device)
+        fusing = Fusing(self.fuse, self.mixed)
         for s in range(sources.shape[1]):
             pairs = torch.stack([reference, sources[:, s]], 1)
-            corr, seen = correlate(features, pairs, relative[:, s], planes, self.config.groups[0])
-            seen = seen.unsqueeze(-1)
-            with self.mixed(features.device):
-                out = self.fuse(torch.cat([corr, seen, corr.mean(-1, keepdim=True)], -1))
-            weight = out[..., -1:].float().clamp(-8, 8).exp() * seen
-            total = total + weight * out[..., :-1]
-            weights = weights + weight
-        return total / (weights + 1e-6)
+            fusing.add(*correlate(features, pairs, relative[:, s], planes, self.config.groups[0]))
+        return fusing.result()
 
     def decode(
         self, encoded: Encoded, views: Sequence[int] | None = None, context: Prediction | None = None
