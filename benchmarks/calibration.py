@@ -24,9 +24,9 @@ from benchmarks.real import SIZE, arguments, load
 from benchmarks.tables import paragraph, plot_beside, publish, weights_told
 from tco.backbones.sweep import ERROR_UNIT
 from tco.backbones.weights import EMBEDDED, load_sweep
-from tco.consensus import agreed
+from tco.conclusion import concluded
 from tco.optimize import optimize
-from tco.options import ConsensusConfig, TCOConfig
+from tco.options import TCOConfig
 
 EDGES = np.array([0.0, 0.003, 0.005, 0.0075, 0.01, 0.015, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, 1.0])
 APART = np.array([0.0, 0.0005, 0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.05, 1.0])
@@ -92,9 +92,9 @@ def main() -> None:
     curves, apart = {}, {}
     for name in args.sets:
         real = load(name, args.size, args.views)
-        outcome = optimize(network, real.views, real.given, TCOConfig(steps=args.steps))
-        asking = ConsensusConfig()
-        together = agreed(outcome.prediction, outcome.cameras, real.views, real.given, asking)
+        config = TCOConfig(steps=args.steps)
+        outcome = optimize(network, real.views, real.given, config)
+        together = concluded(outcome, real.views, real.given, config).agreement
         prediction, known = together.prediction, real.truth > 0
         error = (prediction.depth / real.truth.clamp_min(1e-6) - 1).abs()[known].clamp_max(0.5)
         predicted = (ERROR_UNIT / (prediction.confidence[known] - 1).clamp_min(1e-3)).to(torch.float64)
