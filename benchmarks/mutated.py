@@ -88,7 +88,7 @@ MUTATIONS = [
         ("max(row[n], f32(0))", "row[n]"),
         ("if seen[cell] > 0:", "if seen[cell] >= 0:"),
         ("min(max(weight[n], -most), most)", "weight[n]"),
-        ("cell + 1 < cells:", "cell + 2 < cells:"),
+        ("cell + 1 < cells:", "cell < cells:"),
     ),
     *_of(
         "tco/surfels.py",

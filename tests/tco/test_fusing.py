@@ -40,7 +40,7 @@ def fused(net: nn.Sequential, parts: list[tuple[Tensor, Tensor]], loops: bool) -
 
 
 @pytest.mark.parametrize("cells", [(1,), (CELLS - 1,), (CELLS + 1,), (2, 3, 7, 50)])
-@pytest.mark.parametrize("scale", [1.0, 100.0], ids=["weights as they come", "bounded weights"])
+@pytest.mark.parametrize("scale", [1.0, 100.0], ids=["free", "bounded"])
 @pytest.mark.parametrize("threads", [1, 3])
 def test_loops_are_what_torch_says(cells: tuple[int, ...], scale: float, threads: int) -> None:
     net, parts, whole = layers(scale), said(cells), torch.get_num_threads()
