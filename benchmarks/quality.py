@@ -3,7 +3,8 @@
 ``python -m benchmarks.quality --steps 0 5 --baselines interp patchmatch`` prints a Markdown table;
 ``--output docs/quality.md`` writes it, and ``--part`` says which of that file it is.
 PatchMatch needs ``pip install --no-deps pyarchinit-photogrammetry-core``.
-``--sets`` also takes the rendered scenes of ``benchmarks/rendered.py``, which are scored against their truth.
+``--sets`` also takes the rendered scenes of ``benchmarks/rendered.py``, which are scored against their truth, and
+stretches of real sequences on which nothing was chosen (``benchmarks/unseen.py``), such as ``icl-140``.
 Workspaces are copied to ``--work`` first; the shared sets are only read.
 """
 
@@ -20,7 +21,8 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks.rendered import SCENES, made
+from benchmarks import rendered, unseen
+from benchmarks.rendered import SCENES
 from benchmarks.tables import FIRST, paragraph, publish, to_file, weights_told
 from colmap_tco.published import NETWORKS
 from colmap_tco.weights import located
@@ -94,10 +96,24 @@ def row(name: str, what: str, figures: dict[str, float], seconds: float, peak: f
 
 
 def source(name: str, work: Path) -> Path:
-    """The workspace of a set with its truth: a shared one, or a rendered one, which is made if need be."""
+    """The workspace of a set with its truth: a shared one, or one that is made if it is not there."""
     if name in SETS:
         return SHARED / "data" / name
-    return made(name, work.parent / "rendered")
+    if unseen.is_stretch(name):
+        return unseen.made(name, work.parent / "unseen")
+    return rendered.made(name, work.parent / "rendered")
+
+
+def known(name: str) -> str:
+    """The name of a set, if it is one.
+
+    Raises:
+        ArgumentTypeError: it is none.
+    """
+    if name in SETS or name in SCENES or unseen.is_stretch(name):
+        return name
+    stretches = ", ".join(f"{sequence}-NUMBER" for sequence in unseen.SEQUENCES)
+    raise argparse.ArgumentTypeError(f"{name} is none of {', '.join([*SETS, *SCENES])}, {stretches}")
 
 
 def copied(name: str, work: Path) -> Path:
@@ -133,7 +149,7 @@ def densified(name: str, steps: int, work: Path, rest: list[str]) -> tuple[dict[
 def parser() -> argparse.ArgumentParser:
     """Command line; what it does not know is handed to densify."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0], allow_abbrev=False)
-    parser.add_argument("--sets", nargs="+", default=list(SETS), choices=[*SETS, *SCENES])
+    parser.add_argument("--sets", nargs="+", default=list(SETS), type=known)
     parser.add_argument("--steps", nargs="+", type=int, default=[0, TCOConfig().steps])
     parser.add_argument("--baselines", nargs="*", default=["interp"], help="interp, patchmatch")
     parser.add_argument("--work", type=Path, default=Path("runs/quality"))
