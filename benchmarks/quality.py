@@ -3,8 +3,8 @@
 ``python -m benchmarks.quality --steps 0 5 --baselines interp patchmatch`` prints a Markdown table;
 ``--output docs/quality.md`` writes it, and ``--part`` says which of that file it is.
 PatchMatch needs ``pip install --no-deps pyarchinit-photogrammetry-core``.
-``--sets`` also takes the rendered scenes of ``benchmarks/rendered.py``, which are scored against their truth, and
-stretches of real sequences on which nothing was chosen (``benchmarks/unseen.py``), such as ``icl-140``.
+``--sets`` also takes the rendered scenes of ``benchmarks/rendered.py``, which are scored against their truth,
+and stretches of real sequences on which nothing was chosen (``benchmarks/unseen.py``), such as ``icl-140``.
 Workspaces are copied to ``--work`` first; the shared sets are only read.
 """
 

@@ -1,13 +1,13 @@
-"""Real scenes on which nothing was chosen: other stretches of the sequences that the shared sets are taken from.
+"""Real scenes on which nothing was chosen: other stretches of the sequences that the shared sets are from.
 
     git clone https://github.com/andyzeng/tsdf-fusion-python runs/sources/tsdf-fusion-python
     git clone https://github.com/ardaduz/deep-video-mvs runs/sources/deep-video-mvs
     git clone https://github.com/isl-org/open3d_downloads runs/sources/open3d_downloads
     python -m benchmarks.quality --sets redkitchen-000 hololens-200 icl-140 --baselines interp patchmatch
 
-A stretch is named after its sequence and first frame. It becomes a workspace with ``images/``, ``sparse/`` made
-by COLMAP, and ``gt/`` as ``../shared/tools/score.py`` reads it. Nothing of the sequences is part of this repository;
-their own terms hold (7-Scenes, Hololens frames of deep-video-mvs, ICL-NUIM).
+A stretch is named after its sequence and first frame. It becomes a workspace with ``images/``, ``sparse/``
+made by COLMAP, and ``gt/`` as ``../shared/tools/score.py`` reads it. Nothing of the sequences is part of this
+repository; their own terms hold (7-Scenes, Hololens frames of deep-video-mvs, ICL-NUIM).
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ FARTHEST = 10_000
 DEPTH_CAMERA = (585.0, 320.0, 240.0)
 COLOUR_CAMERA = (525.5, 314.5, 235.2)
 COLOUR_BESIDE = (-22.0, 2.0)
-"""Focal length and principal point of the Kinect's two cameras, pixels, and where a point of the one is in the
-other, millimetres: those with which the sensor's depths fall on the registered ones of the shared ``kitchen``, to
-3 mm in the median of three frames."""
+"""Focal length and principal point of the Kinect's two cameras, pixels, and where a point of the one is in
+the other, millimetres: those with which the sensor's depths fall on the registered ones of the shared
+``kitchen``, to 3 mm in the median of three frames."""
 
 
 def registered(depth: NDArray) -> NDArray:
-    """Depths (H, W) of the Kinect's depth camera, millimetres, as its colour camera sees them; 0 where unknown.
+    """Depths (H, W) of the Kinect's depth camera, millimetres, as its colour camera sees them; 0 if unknown.
 
     Each depth falls on one pixel, and the nearest of those that fall on the same one is kept.
     """

@@ -38,6 +38,11 @@ relative error at which it is half of that."""
 SLANTED, REACH = (10.0, 25.0), 6.0
 """Degrees from a direction at which a surface begins to be slanted, and at which it is altogether; pixels to
 each side over which its normal is taken."""
+ELSEWHERE, CLEAR, VAGUE = 1.0, 0.5, 0.05
+"""For a pixel that keeps its depth: weight of how much rarer its colour is off all planes than in the view,
+in powers of e, of which so much does not count; the relative error of the depth at which half of that does.
+A plain door behind a table has the colours of the doors beside it, which are on a plane, whatever the network
+makes of it."""
 NEAR = 0.05
 """Relative error that larger ones count as where the colours of a plane are gathered: what is hardly known at
 all is near every plane."""
@@ -62,26 +67,34 @@ def labelled(
     """
     colours = colour_bins(view)
     keep = np.zeros_like(view.depth) if frame is None else cost_of_keeping(view, frame, config)
-    tried, costs, logs = [0], [keep], [np.log(view.depth)]
+    tried, costs, logs, on_any = [0], [keep], [np.log(view.depth)], np.zeros_like(view.depth)
     for k, plane in enumerate(planes):
         depth = plane.depth(view)
-        cost = cost_of(view, plane, depth, colours, config)
+        cost, near = cost_of(view, plane, depth, colours, config)
         if frame is not None:
             cost = np.minimum(cost + cost_of_facing(plane, frame, config), NEVER)
         if ((cost < WORTH * config.plane_trust) & (cost < NEVER)).mean() >= FEW:
             tried.append(k + 1)
             costs.append(cost)
             logs.append(np.log(np.where(depth > 0, depth, 1)))
+            on_any = np.maximum(on_any, near)
     if len(tried) == 1:
         return np.zeros(view.depth.shape, np.int64)
+    costs[0] = keep + cost_of_colour(view, colours, on_any)
     unary, log_depth = (np.ascontiguousarray(np.stack(x, -1), np.float32) for x in (costs, logs))
     right, down = borders(view, config.plane_smoothness)
     chosen = least_labels(unary, log_depth, right, down, (STEP, CHANGE), SWEEPS)
     return np.asarray(tried)[chosen]
 
 
-def cost_of(view: Shown, plane: Plane, depth: Floats, colours: Labels, config: ConsensusConfig) -> Floats:
-    """What it costs (H, W) to take a plane, of these depths, instead of keeping one's own."""
+def cost_of(
+    view: Shown, plane: Plane, depth: Floats, colours: Labels, config: ConsensusConfig
+) -> tuple[Floats, Floats]:
+    """What it costs to take a plane, of these depths, instead of keeping one's own.
+
+    Returns:
+        The cost (H, W); and how much a pixel is on the plane by its own depth, (H, W) 0 to 1.
+    """
     there = (depth > 0) & view.known
     off = np.where(there, np.log(np.where(there, depth, 1) / view.depth), 0)
     apart = (off / (WIDE * view.error).clip(LEAST, MOST)) ** 2
@@ -89,7 +102,22 @@ def cost_of(view: Shown, plane: Plane, depth: Floats, colours: Labels, config: C
     cost += DOUBT * (plane.error(view, depth) / UNSURE) ** 2
     near = np.exp(-0.5 * (off / view.error.clip(LEAST / WIDE, NEAR)) ** 2) * there
     cost += UNLIKE * rarity(colours, view.sure.clip(0, CERTAIN) ** 2, near)[colours]
-    return np.where(there, cost.clip(0, NEVER), NEVER).astype(np.float32)
+    return np.where(there, cost.clip(0, NEVER), NEVER).astype(np.float32), near
+
+
+def cost_of_colour(view: Shown, colours: Labels, on_any: Floats) -> Floats:
+    """What it costs (H, W) to keep a depth that is unsure, where sure pixels of that colour are on planes.
+
+    Args:
+        view: with its depths.
+        colours: (H, W) bins.
+        on_any: (H, W) how much a pixel is on one of the planes by its own depth, 0 to 1.
+    """
+    rare = rarity(colours, view.sure.clip(0, CERTAIN) ** 2, 1 - on_any)[colours]
+    unsure = (view.error / VAGUE) ** 2
+    return np.asarray(
+        ELSEWHERE * np.maximum(rare - CLEAR, 0) * unsure / (1 + unsure) * view.known, np.float32
+    )
 
 
 def cost_of_facing(plane: Plane, frame: Frame, config: ConsensusConfig) -> float:

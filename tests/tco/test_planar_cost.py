@@ -14,8 +14,21 @@ from tco.consensus import Agreement
 from tco.options import ConsensusConfig
 from tco.planar import run
 from tco.planar.fit import refit
-from tco.planar.label import CERTAIN, MOST_UNLIKE, NEVER, UNLIKE, colour_bins, cost_of
-from tco.planar.view import Floats, Plane, Shown, shown
+from tco.planar.label import (
+    CERTAIN,
+    CLEAR,
+    ELSEWHERE,
+    MOST_UNLIKE,
+    NEVER,
+    SHRINK,
+    UNLIKE,
+    VAGUE,
+    colour_bins,
+    cost_of,
+    cost_of_colour,
+    labelled,
+)
+from tco.planar.view import ERROR, Floats, Plane, Shown, shown
 from tco.toy import Wall, wall
 from tco.types import Prediction
 
@@ -41,7 +54,13 @@ def seen(scene: Wall, depth: Tensor, confidence: Tensor | None = None) -> list[S
 
 def cost(view: Shown) -> Floats:
     """Of the wall's own plane, which is known exactly."""
-    return cost_of(view, KNOWN, KNOWN.depth(view), colour_bins(view), CONFIG)
+    return cost_of(view, KNOWN, KNOWN.depth(view), colour_bins(view), CONFIG)[0]
+
+
+def cost_of_keeping_on_colour(view: Shown) -> Floats:
+    """Beside the wall's own plane as the only one."""
+    colours = colour_bins(view)
+    return cost_of_colour(view, colours, cost_of(view, KNOWN, KNOWN.depth(view), colours, CONFIG)[1])
 
 
 def plain(view: Shown) -> Shown:
@@ -84,6 +103,58 @@ def test_pixels_count_for_the_colours_of_a_plane_with_the_square_of_their_confid
     on_it, anywhere = here / (here + grey), (here + behind) / (here + behind + grey)
     found = cost(replace(view, image=image))
     assert found[45, 60] == pytest.approx(UNLIKE * math.log(anywhere / on_it), rel=0.1)
+
+
+@pytest.fixture
+def door(scene: Wall) -> tuple[Shown, slice, slice]:
+    """A grey wall, a red thing before it, known well, and a part of the wall with wrong and unsure depths."""
+    depth, sure = scene.depth.clone(), torch.full_like(scene.depth, 4.0)
+    depth[2, 20:80, 10:40] *= 0.6
+    depth[2, 40:56, 80:104] *= 0.8
+    sure[2, 40:56, 80:104] = 1.5
+    view = plain(seen(scene, depth, sure)[2])
+    image = view.image.copy()
+    image[20:80, 10:40] = (0.9, 0.1, 0.1)
+    return replace(view, image=image), slice(44, 52), slice(84, 100)
+
+
+def test_a_depth_of_a_colour_that_is_on_planes_elsewhere_costs_by_how_unsure_it_is(
+    door: tuple[Shown, slice, slice],
+) -> None:
+    """The chance of grey off the plane against that anywhere, shrunk as for planes. Red costs nothing."""
+    view, rows, columns = door
+    red, unsure, pixels = 60 * 30 * CERTAIN**2, 16 * 24, 96 * 128
+    for sure in (0.5, 1.0, 2.0):
+        held = view.sure.copy()
+        held[40:56, 80:104] = sure
+        found = cost_of_keeping_on_colour(replace(view, sure=held))
+        off = unsure * sure**2
+        every = (pixels - 60 * 30 - unsure) * CERTAIN**2 + off
+        ratio = (off + SHRINK * every) / (off + red + SHRINK * (every + red)) * (every + red) / every
+        times = (ERROR / sure / VAGUE) ** 2
+        expected = ELSEWHERE * (min(-math.log(ratio), MOST_UNLIKE) - CLEAR) * times / (1 + times)
+        np.testing.assert_allclose(found[rows, columns], expected, rtol=0.05)
+        assert found[30:70, 15:35].max() == 0.0
+
+
+def test_colours_that_are_off_planes_as_often_as_on_them_cost_nothing(
+    door: tuple[Shown, slice, slice],
+) -> None:
+    view, rows, columns = door
+    found = cost_of_keeping_on_colour(plain(view))
+    assert found[rows, columns].max() == 0.0
+
+
+def test_an_unsure_depth_goes_to_the_plane_that_has_its_colour(door: tuple[Shown, slice, slice]) -> None:
+    """A fifth too near and unsure: grey as the wall it is of the wall, red as the thing before it is not."""
+    view, rows, columns = door
+    config = replace(CONFIG, plane_trust=2.0)
+    grey = labelled(view, [KNOWN], config)
+    image = view.image.copy()
+    image[40:56, 80:104] = (0.9, 0.1, 0.1)
+    red = labelled(replace(view, image=image), [KNOWN], config)
+    assert (grey[rows, columns] == 1).all() and (grey[25:75, 15:35] == 0).all()
+    assert (red[rows, columns] == 0).all()
 
 
 def test_where_there_is_no_depth_the_plane_cannot_be(scene: Wall) -> None:
