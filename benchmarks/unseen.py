@@ -95,7 +95,7 @@ def is_stretch(name: str) -> bool:
 
 
 def made(name: str, root: Path) -> Path:
-    """The workspace of a stretch; taken out of its sequence and mapped if it is not there yet.
+    """The workspace of a stretch; taken out of its sequence, and mapped, if it is not there yet.
 
     Raises:
         SystemExit: the sequence is not there, or COLMAP does not register enough of the frames.
@@ -107,7 +107,8 @@ def made(name: str, root: Path) -> Path:
     sequence = SEQUENCES[word]
     base = SOURCES / sequence.repository
     frames = [int(first) + sequence.step * i for i in range(VIEWS)]
-    shutil.rmtree(folder, ignore_errors=True)
+    for part in ("images", "gt"):
+        shutil.rmtree(folder / part, ignore_errors=True)
     for part in ("images", "gt/depth"):
         (folder / part).mkdir(parents=True)
     for frame in frames:

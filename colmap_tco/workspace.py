@@ -14,6 +14,7 @@ from colmap_tco import _pycolmap, model_files
 from colmap_tco._pycolmap import Model, Registered
 from colmap_tco.errors import InputError
 from colmap_tco.image_files import PICTURES, decoded_size, list_images, other_formats
+from colmap_tco.lens import warn_of_lenses
 from tco.config import knob
 
 log = logging.getLogger(__name__)
@@ -183,6 +184,7 @@ def open_workspace(
         )
     for reason in reasons:
         log.info("%s", reason)
+    warn_of_lenses(entries)
     if skipped:
         log.warning("%d of %d images are skipped:\n%s", len(skipped), len(entries), listing(skipped))
     others = unregistered_images(root, folder, [entry.name for entry in entries], elsewhere, num_threads)
