@@ -51,6 +51,10 @@ class Table:
 
 
 _ALL = ("--sets", "kitchen", "office", "livingroom", *SCENES)
+_UNTUNED = (
+    "redkitchen-075", "redkitchen-200", "redkitchen-380", "redkitchen-530", "redkitchen-560",
+    "redkitchen-920", "hololens-045", "hololens-060", "icl-060", "icl-120",
+)  # fmt: skip
 _RENDERED = ("--sets", *SCENES)
 _TWO, _THREE = ("--seeds", "2"), ("--seeds", "3")
 
@@ -61,6 +65,10 @@ TABLES = (
           ("--baselines", "--steps", "5", "--max_image_size", "384"), "384 pixels"),
     Table("quality-256", "quality", "quality.md",
           ("--baselines", "--steps", "0", "5", "--max_image_size", "256"), "256 pixels"),
+    Table("quality-640", "quality", "quality.md",
+          ("--baselines", "--steps", "0", "5", "--max_image_size", "640"), "640 pixels"),
+    Table("quality-untuned", "quality", "quality.md",
+          ("--sets", *_UNTUNED, "--baselines", "interp", "patchmatch"), "scenes not tuned on"),
     Table("quality-steps", "quality", "quality.md",
           ("--baselines", "--steps", "10", "20", "40"), "more steps"),
     Table("quality-seed", "quality", "quality.md",

@@ -337,7 +337,12 @@ MUTATIONS = [
         ("apart / (1 + apart)", "apart"),
         ("DOUBT * (plane.error(view, depth) / UNSURE) ** 2", "0 * depth"),
         ("UNLIKE * rarity(", "0 * rarity("),
-        ("view.sure.clip(0, CERTAIN) ** 2", "view.sure.clip(0, CERTAIN)"),
+        ("view.sure.clip(0, CERTAIN) ** 2, near", "view.sure.clip(0, CERTAIN), near"),
+        ("view.sure.clip(0, CERTAIN) ** 2, 1 - on_any", "view.sure.clip(0, CERTAIN), 1 - on_any"),
+        ("1 - on_any)[colours]", "on_any)[colours]"),
+        ("np.maximum(rare - CLEAR, 0)", "rare"),
+        ("* unsure / (1 + unsure) * view.known", "* view.known"),
+        ("costs[0] = keep + cost_of_colour(view, colours, on_any)", "costs[0] = keep"),
         ("np.exp(-((change / EDGE) ** 2))", "1.0"),
         ("np.where(there, cost.clip(0, NEVER), NEVER)", "cost.clip(0, NEVER)"),
     ),
@@ -481,6 +486,15 @@ MUTATIONS = [
         "tco/backbones/sweep.py",
         "hints",
         ("torch.stack([world.inverse, world.log_error], 1)", "torch.stack([world.log_error] * 2, 1)"),
+    ),
+    *(
+        Mutation("colmap_tco/lens.py", old, new, ("tests/colmap_tco/test_lens.py",))
+        for old, new in (
+            ("if much > MOST:", "if much > 0:"),
+            ("(corners - middle) /", "corners /"),
+            (".max())", ".mean())"),
+            ("{entry.camera.camera_id: entry.camera", "{entry.image_id: entry.camera"),
+        )
     ),
     *_of(
         "tco/align.py",

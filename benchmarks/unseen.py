@@ -3,15 +3,19 @@
     git clone https://github.com/andyzeng/tsdf-fusion-python runs/sources/tsdf-fusion-python
     git clone https://github.com/ardaduz/deep-video-mvs runs/sources/deep-video-mvs
     git clone https://github.com/isl-org/open3d_downloads runs/sources/open3d_downloads
-    python -m benchmarks.quality --sets redkitchen-000 hololens-200 icl-140 --baselines interp patchmatch
+    python -m benchmarks.unseen redkitchen-200 hololens-060 icl-120
+    python -m benchmarks.quality --sets redkitchen-200 hololens-060 icl-120 --baselines interp patchmatch
 
 A stretch is named after its sequence and first frame. It becomes a workspace with ``images/``, ``sparse/``
 made by COLMAP, and ``gt/`` as ``../shared/tools/score.py`` reads it. Nothing of the sequences is part of this
-repository; their own terms hold (7-Scenes, Hololens frames of deep-video-mvs, ICL-NUIM).
+repository; their own terms hold (7-Scenes, Hololens frames of deep-video-mvs, ICL-NUIM). The first command
+tells how many of COLMAP's own points agree with the sensor: where few do, the model is bent, and no depth can
+be right.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import shutil
@@ -124,7 +128,7 @@ def made(name: str, root: Path) -> Path:
         sys.exit(f"{model}: COLMAP registered {_views(model)} of {VIEWS} frames, fewer than {FEWEST}")
     told = {
         "model": str(model.relative_to(folder)),
-        "metres_per_colmap_unit": metres(folder, model),
+        "metres_per_colmap_unit": float(np.median(measured_by_triangulated(folder, model))),
         "images": _views(model),
     }
     (folder / "gt" / "gt.json").write_text(json.dumps(told), encoding="utf-8")
@@ -135,8 +139,8 @@ def _views(model: Path) -> int:
     return len(_pycolmap.registered(_pycolmap.read_model(model)))
 
 
-def metres(folder: Path, path: Path) -> float:
-    """Metres of one unit of a model: the median of measured by triangulated depth over all observations."""
+def measured_by_triangulated(folder: Path, path: Path) -> Floats:
+    """Measured depth, metres, by triangulated depth in the model's unit, of each observation that has both."""
     model = _pycolmap.read_model(path)
     tracks, ratios = read_tracks(model), []
     for entry in _pycolmap.registered(model):
@@ -148,4 +152,31 @@ def metres(folder: Path, path: Path) -> float:
         x, y = np.floor(seen.xy).astype(int).T
         measured = depth[y.clip(0, depth.shape[0] - 1), x.clip(0, depth.shape[1] - 1)]
         ratios.append(measured[measured > 0] / z[measured > 0])
-    return float(np.median(np.concatenate(ratios)))
+    return np.concatenate(ratios)
+
+
+def agreeing(folder: Path) -> float:
+    """Share of the observations of COLMAP's points whose depth is within 5 % of the sensor's."""
+    told = json.loads((folder / "gt" / "gt.json").read_text("utf-8"))
+    ratios = measured_by_triangulated(folder, folder / told["model"])
+    return float((np.abs(told["metres_per_colmap_unit"] / ratios - 1) < 0.05).mean())
+
+
+def main() -> None:
+    """Make stretches and tell of each how good COLMAP's model of it is."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("names", nargs="+", metavar="SEQUENCE-FRAME", help=f"of {', '.join(SEQUENCES)}")
+    parser.add_argument("--work", type=Path, default=Path("runs/unseen"), help="folder of the workspaces")
+    args = parser.parse_args()
+    strange = [name for name in args.names if not is_stretch(name)]
+    if strange:
+        parser.error(f"no stretch: {', '.join(strange)}")
+    for name in args.names:
+        folder = made(name, args.work)
+        print(
+            f"{name}: {100 * agreeing(folder):.1f} % of COLMAP's points within 5 % of the sensor", flush=True
+        )
+
+
+if __name__ == "__main__":
+    main()

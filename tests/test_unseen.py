@@ -84,6 +84,7 @@ def test_frames_become_a_workspace_with_its_truth(
     told = json.loads((folder / "gt" / "gt.json").read_text("utf-8"))
     assert told == {"model": "sparse/0", "metres_per_colmap_unit": pytest.approx(0.25, rel=0.01), "images": 5}
     assert [file.name for file in sorted((folder / "images").iterdir())] == names
+    assert unseen.agreeing(folder) == pytest.approx(2 / 3, abs=0.03)
     truth = cv2.imread(str(folder / "gt" / "depth" / names[1]), cv2.IMREAD_UNCHANGED)
     assert truth[0].max() == 0 and truth.max() > 0
     monkeypatch.setattr(unseen, "FEWEST", 6)
