@@ -140,7 +140,7 @@ def _views(model: Path) -> int:
 
 
 def measured_by_triangulated(folder: Path, path: Path) -> Floats:
-    """Measured depth, metres, by triangulated depth in the model's unit, of each observation that has both."""
+    """Measured depth, metres, by triangulated depth in the model's unit, of each observation with both."""
     model = _pycolmap.read_model(path)
     tracks, ratios = read_tracks(model), []
     for entry in _pycolmap.registered(model):
