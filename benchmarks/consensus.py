@@ -13,8 +13,9 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 
-from benchmarks.real import SETS, SIZE, RealSet, arguments, load, median_error, within
+from benchmarks.real import SIZE, RealSet, arguments, load, median_error, within
 from benchmarks.rendered import SCENES
+from benchmarks.sets import SETS
 from benchmarks.tables import paragraph, publish, weights_told
 from tco.backbones.weights import EMBEDDED, load_sweep
 from tco.consensus import agreed

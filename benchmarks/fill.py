@@ -23,7 +23,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.quality import COLUMNS, SETS, copied, run, scored, source
+from benchmarks.quality import COLUMNS, copied, run, scored
+from benchmarks.sets import SETS, workspace
 from benchmarks.tables import paragraph, publish, to_file
 from colmap_tco import _pycolmap
 from colmap_tco.export.dense import DenseView, open_dense
@@ -177,7 +178,7 @@ def main() -> None:
         shutil.rmtree(making, ignore_errors=True)
         make_patchmatch(root, making)
         making.rename(dense)
-    truth, count = source(args.set, args.work), len(list((root / "images").iterdir()))
+    truth, count = workspace(args.set, args.work.parent), len(list((root / "images").iterdir()))
     figures, _ = scored(truth, "--dense", str(dense))
     text = paragraph(
         f"`{args.set}`, {count} views (`python -m benchmarks.fill {args.set}`): PatchMatch of "

@@ -19,8 +19,9 @@ import numpy as np
 from torch import Tensor
 
 from benchmarks.planes import FIRST_SEED, random_scene
-from benchmarks.real import SETS, SIZE, arguments, load
+from benchmarks.real import SIZE, arguments, load
 from benchmarks.rendered import SCENES
+from benchmarks.sets import SETS
 from benchmarks.tables import paragraph, publish, weights_told
 from tco.backbones.sweep import Sweep
 from tco.backbones.weights import EMBEDDED, load_sweep

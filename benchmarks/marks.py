@@ -18,7 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.real import SETS, SIZE, RealSet, arguments, load
+from benchmarks.real import SIZE, RealSet, arguments, load
+from benchmarks.sets import SETS
 from benchmarks.tables import paragraph, publish, weights_told
 from tco.backbones.weights import EMBEDDED, load_sweep
 from tco.conclusion import concluded

@@ -341,8 +341,8 @@ MUTATIONS = [
         ("view.sure.clip(0, CERTAIN) ** 2, 1 - on_any", "view.sure.clip(0, CERTAIN), 1 - on_any"),
         ("1 - on_any)[colours]", "on_any)[colours]"),
         ("np.maximum(rare - CLEAR, 0)", "rare"),
-        ("* unsure / (1 + unsure) * view.known", "* view.known"),
-        ("costs[0] = keep + cost_of_colour(view, colours, on_any)", "costs[0] = keep"),
+        ("0) * unsure / (1 + unsure)\n    return", "0)\n    return"),
+        ("costs[0] = keep + cost_of_colour(view, colours, on_any, config)", "costs[0] = keep"),
         ("np.exp(-((change / EDGE) ** 2))", "1.0"),
         ("np.where(there, cost.clip(0, NEVER), NEVER)", "cost.clip(0, NEVER)"),
     ),
@@ -490,10 +490,11 @@ MUTATIONS = [
     *(
         Mutation("colmap_tco/lens.py", old, new, ("tests/colmap_tco/test_lens.py",))
         for old, new in (
-            ("if much > MOST:", "if much > 0:"),
+            ("if share > MOST}", "if share > 0}"),
             ("(corners - middle) /", "corners /"),
             (".max())", ".mean())"),
             ("{entry.camera.camera_id: entry.camera", "{entry.image_id: entry.camera"),
+            ("max(strange, key", "min(strange, key"),
         )
     ),
     *_of(

@@ -18,8 +18,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from torch import Tensor
 
-from benchmarks.real import SETS, SIZE, arguments, load
+from benchmarks.real import SIZE, arguments, load
 from benchmarks.rendered import SCENES
+from benchmarks.sets import SETS
 from benchmarks.tables import paragraph, publish, weights_told
 from tco.backbones.weights import EMBEDDED, load_sweep
 from tco.conclusion import concluded
@@ -61,6 +62,7 @@ def variants() -> Iterator[tuple[str, ConsensusConfig]]:
         yield f"plane_smoothness {smoothness}", replace(plain, plane_smoothness=smoothness)
     for square in (0.0, 1.0):
         yield f"plane_square {square}", replace(plain, plane_square=square)
+    yield "plane_colour 0.0", replace(plain, plane_colour=0.0)
 
 
 def random_scene(seed: int) -> tuple[Views, Priors, Tensor] | None:

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.real import SETS, SHARED
+from benchmarks.sets import SETS, SHARED
 from benchmarks.tables import publish, to_file
 from colmap_tco import _pycolmap
 from colmap_tco.evaluation.sources import read_cameras, read_tum, world_from_cam
@@ -63,7 +63,7 @@ def measured(
     name: str, seed: int | None, config: PoseConfig
 ) -> tuple[float, TrajectoryFigures, TrajectoryFigures, float]:
     """Mean distance of the centres, figures before and after, and seconds; no seed: COLMAP's own poses."""
-    root = SHARED / name
+    root = SHARED / "data" / name
     known = json.loads((root / "gt" / "gt.json").read_text(encoding="utf-8"))
     entries = read_cameras(root / known["model"])
     truth = world_from_cam([entries[image] for image in sorted(entries)])

@@ -21,15 +21,12 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks import rendered, unseen
-from benchmarks.rendered import SCENES
+from benchmarks.sets import SETS, SHARED, known, workspace
 from benchmarks.tables import FIRST, paragraph, publish, to_file, weights_told
 from colmap_tco.published import NETWORKS
 from colmap_tco.weights import located
 from tco.options import TCOConfig
 
-SHARED = Path(__file__).resolve().parents[2] / "shared"
-SETS = ("kitchen", "office", "livingroom")
 COLUMNS = ("cover", "med", "d2", "d5", "f5", "acc", "comp", "points")
 LEGEND = (
     f"Pictures of {NETWORKS['sweep'].image_size} pixels unless an option says otherwise. PatchMatch is a "
@@ -78,9 +75,9 @@ def run(command: list[str]) -> Done:
     return done
 
 
-def scored(workspace: Path, *words: str) -> tuple[dict[str, float], float]:
+def scored(root: Path, *words: str) -> tuple[dict[str, float], float]:
     """Figures of the shared scorer, and its peak memory."""
-    done = run([sys.executable, str(SHARED / "tools" / "score.py"), str(workspace), *words])
+    done = run([sys.executable, str(SHARED / "tools" / "score.py"), str(root), *words])
     figures: dict[str, float] = json.loads(done.text.splitlines()[-1])
     return figures, done.peak
 
@@ -95,30 +92,9 @@ def row(name: str, what: str, figures: dict[str, float], seconds: float, peak: f
     )
 
 
-def source(name: str, work: Path) -> Path:
-    """The workspace of a set with its truth: a shared one, or one that is made if it is not there."""
-    if name in SETS:
-        return SHARED / "data" / name
-    if unseen.is_stretch(name):
-        return unseen.made(name, work.parent / "unseen")
-    return rendered.made(name, work.parent / "rendered")
-
-
-def known(name: str) -> str:
-    """The name of a set, if it is one.
-
-    Raises:
-        ArgumentTypeError: it is none.
-    """
-    if name in SETS or name in SCENES or unseen.is_stretch(name):
-        return name
-    stretches = ", ".join(f"{sequence}-NUMBER" for sequence in unseen.SEQUENCES)
-    raise argparse.ArgumentTypeError(f"{name} is none of {', '.join([*SETS, *SCENES])}, {stretches}")
-
-
 def copied(name: str, work: Path) -> Path:
     """A workspace with the model and the pictures of a shared set, in which a result may be written."""
-    original, copy = source(name, work), work / name
+    original, copy = workspace(name, work.parent), work / name
     if not copy.exists():
         shutil.copytree(original / "sparse", copy / "sparse")
         os.symlink((original / "images").resolve(), copy / "images")
@@ -143,7 +119,7 @@ def densified(name: str, steps: int, work: Path, rest: list[str]) -> tuple[dict[
     kept = work / f"{name}-{steps}"
     shutil.rmtree(kept, ignore_errors=True)
     shutil.copytree(copy / "dense-tco", kept)
-    return scored(source(name, work), "--dense", str(kept))[0], done.seconds, done.peak
+    return scored(workspace(name, work.parent), "--dense", str(kept))[0], done.seconds, done.peak
 
 
 def parser() -> argparse.ArgumentParser:
@@ -164,7 +140,8 @@ def main() -> None:
     head = (
         "| set | method | " + " | ".join(COLUMNS) + " | s | s / view | GiB |\n" + "|---" * (len(COLUMNS) + 5)
     )
-    told = " ".join(["--steps", *map(str, args.steps), *rest])
+    chosen = [] if args.sets == list(SETS) else ["--sets", *args.sets]
+    told = " ".join([*chosen, "--steps", *map(str, args.steps), *rest])
     made = f"`python -m benchmarks.quality {told}`: {weights_told(located(NETWORKS['sweep']))}."
     about = paragraph(f"{made} {LEGEND}" if args.part == FIRST else made)
     text = f"# Quality, measured\n\n{about}\n{head}|\n"
@@ -177,10 +154,10 @@ def main() -> None:
         sys.stdout.flush()
 
     for name in args.sets:
-        views = len(list((source(name, args.work) / "images").iterdir()))
+        views = len(list((workspace(name, args.work.parent) / "images").iterdir()))
         for baseline in args.baselines:
             half = ["--half"] if baseline == "patchmatch" else []
-            figures, peak = scored(source(name, args.work), "--baseline", baseline, *half)
+            figures, peak = scored(workspace(name, args.work.parent), "--baseline", baseline, *half)
             add(row(name, baseline, figures, figures["seconds"], peak, views))
         for steps in args.steps:
             figures, seconds, peak = densified(name, steps, args.work, rest)

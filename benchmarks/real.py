@@ -1,14 +1,12 @@
 """Sets as the optimisation sees them, with the true depth in the same pixels and unit.
 
-The shared real sets have that of a sensor; the rendered scenes (``benchmarks/rendered.py``) are made where
-they are asked for and not there yet.
+Sets are those of ``benchmarks/sets.py``.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.rendered import SCENES, made
+from benchmarks.sets import SETS, known, workspace
 from benchmarks.tables import to_file
 from colmap_tco.priors import PriorSet, build_priors, chunk_frame
 from colmap_tco.published import NETWORKS
@@ -26,12 +24,8 @@ from colmap_tco.views import ViewConfig, batch, make_views, original_from_networ
 from colmap_tco.workspace import open_workspace
 from tco.types import Prediction, Priors, Views
 
-SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
-SETS = ("kitchen", "office", "livingroom")
 SIZE = NETWORKS["sweep"].image_size
 """Longer side, pixels, of the pictures that densify gives the embedded network by itself."""
-RENDERED = Path("runs/rendered")
-"""Where rendered scenes are, or are made."""
 
 
 @dataclass(frozen=True)
@@ -57,22 +51,17 @@ def load(name: str, size: int, count: int = 0, stride: int = 16) -> RealSet:
     """The first ``count`` views of a set (0: all), longer sides ``size`` pixels, multiples of ``stride``.
 
     Raises:
-        SystemExit: the shared sets are not beside this checkout.
+        SystemExit: as :func:`benchmarks.sets.workspace`.
     """
-    if name in SCENES:
-        return load_from(made(name, RENDERED), name, size, count, stride)
-    root = SHARED / name
-    if not root.is_dir():
-        sys.exit(f"{root} is not there: this measurement needs the shared real sets")
-    return load_from(root, name, size, count, stride)
+    return load_from(workspace(name), name, size, count, stride)
 
 
 def load_from(root: Path, name: str, size: int, count: int = 0, stride: int = 16) -> RealSet:
     """As :func:`load`, of a workspace anywhere that has its truth beside it, as the shared sets have."""
-    workspace = open_workspace(root)
-    views, _ = make_views(workspace, ViewConfig(max_image_size=size), stride)
+    opened = open_workspace(root)
+    views, _ = make_views(opened, ViewConfig(max_image_size=size), stride)
     views = views[: count or len(views)]
-    tracks = read_tracks(workspace.model)
+    tracks = read_tracks(opened.model)
     frame = chunk_frame(tracks, views)
     unit = json.loads((root / "gt" / "gt.json").read_text())["metres_per_colmap_unit"] * frame.scale
     truth = []
@@ -105,7 +94,7 @@ def median_error(prediction: Prediction, truth: Tensor) -> float:
 def arguments(description: str, sets: tuple[str, ...] = SETS) -> argparse.ArgumentParser:
     """A parser with what all measurements share; ``sets`` are those that are taken if none are named."""
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
-    parser.add_argument("--sets", nargs="+", default=list(sets), choices=(*SETS, *SCENES))
+    parser.add_argument("--sets", nargs="+", default=list(sets), type=known)
     parser.add_argument("--size", type=int, default=192, help="longer side of the views, pixels")
     parser.add_argument("--views", type=int, default=8, help="views of each set; 0 is all")
     parser.add_argument("--steps", type=int, default=24)

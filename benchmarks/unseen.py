@@ -67,13 +67,14 @@ def registered(depth: NDArray) -> NDArray:
 
 @dataclass(frozen=True)
 class Sequence:
-    """Frames of a repository: folder, names of picture and depth by number, and from sensor to picture."""
+    """Frames of a repository: folder, names of picture and depth by number, and, if it is not one camera,
+    how the depth is brought into the picture."""
 
     repository: str
     image: str
     depth: str
     step: int
-    to_picture: Callable[[NDArray], NDArray] = staticmethod(lambda depth: depth)
+    to_picture: Callable[[NDArray], NDArray] | None = None
 
 
 SEQUENCES = {
@@ -122,7 +123,8 @@ def made(name: str, root: Path) -> Path:
             sys.exit(f"{image} or {depth} is not there; {__file__} says how to get the sequences")
         measured[measured > FARTHEST] = 0
         os.symlink(image.resolve(), folder / "images" / image.name)
-        cv2.imwrite(str(folder / "gt" / "depth" / f"{image.stem}.png"), sequence.to_picture(measured))
+        truth = measured if sequence.to_picture is None else sequence.to_picture(measured)
+        cv2.imwrite(str(folder / "gt" / "depth" / f"{image.stem}.png"), truth)
     model = max(ensure_model(folder, num_threads=1), key=_views)
     if _views(model) < FEWEST:
         sys.exit(f"{model}: COLMAP registered {_views(model)} of {VIEWS} frames, fewer than {FEWEST}")

@@ -12,6 +12,7 @@ from colmap_tco._pycolmap import Camera, registered
 from colmap_tco.backbones import NetworkConfig, Selected, choose_device, needed, select
 from colmap_tco.errors import InputError, MissingError
 from colmap_tco.image_files import decoded_size, list_images
+from colmap_tco.lens import implausible
 from colmap_tco.memory import FEWEST_VIEWS, SHARE, chunk_limit, free_memory
 from colmap_tco.pinhole import Pinhole, undistorted_camera
 from colmap_tco.progress import Progress
@@ -129,8 +130,10 @@ def _cameras(root: Path, config: WorkspaceConfig) -> tuple[list[Pinhole], str]:
     folders = [Path(config.model_path)] if config.model_path else find_models(root)
     if folders:
         chosen = choose_model(root, folders)
-        found = [pinhole for entry in registered(chosen.model) for pinhole in _pinhole(entry.camera)]
-        return found, f"{len(found)} images registered in {chosen.folder}"
+        entries = registered(chosen.model)
+        found = [pinhole for entry in entries for pinhole in _pinhole(entry.camera)]
+        told = [f"{len(found)} images registered in {chosen.folder}", *implausible(entries)]
+        return found, "\n".join(told)
     folder, found = find_images(root, config.image_path), []
     for name in list_images(folder, recursive=folder != root):
         try:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import logging
+from collections.abc import Iterable
 
 import numpy as np
 
 from colmap_tco import _pycolmap
 from colmap_tco._pycolmap import Camera, Registered
-
-log = logging.getLogger(__name__)
 
 MOST = 0.05
 """Pincushion distortion at the corners of a picture beyond which a lens is implausible. Barrel distortion has
@@ -35,17 +33,17 @@ def pincushion(camera: Camera) -> float:
     return float(np.nan_to_num(ratio, nan=0.0, posinf=0.0).max())
 
 
-def warn_of_lenses(images: list[Registered]) -> None:
-    """Say of each camera that distorts as no lens does; the shape of its model is probably wrong, too."""
+def implausible(images: Iterable[Registered]) -> list[str]:
+    """A sentence on the cameras that distort as no lens does, if any; the shape of the model is doubtful."""
     cameras = {entry.camera.camera_id: entry.camera for entry in images}
-    for number, camera in cameras.items():
-        if _pycolmap.is_spherical(camera):
-            continue
-        much = pincushion(camera)
-        if much > MOST:
-            log.warning(
-                "camera %d (%s) has %.0f %% of pincushion distortion at the corners, more than lenses have: "
-                "its self-calibration went astray, and the model's shape with it. Map again with a known "
-                "focal length (EXIF, or COLMAP's --ImageReader.camera_params), or with more varied pictures",
-                number, camera.model.name, 100 * much,
-            )  # fmt: skip
+    much = {i: pincushion(c) for i, c in cameras.items() if not _pycolmap.is_spherical(c)}
+    strange = {i: share for i, share in much.items() if share > MOST}
+    if not strange:
+        return []
+    worst = max(strange, key=strange.__getitem__)
+    return [
+        f"{len(strange)} of {len(cameras)} cameras have more pincushion distortion than lenses have, camera "
+        f"{worst} ({cameras[worst].model.name}) {100 * strange[worst]:.0f} % at the corners: the "
+        "self-calibration went astray, and the shape of the model with it. Map again with a known focal "
+        "length (EXIF, or COLMAP's --ImageReader.camera_params), or with more varied pictures"
+    ]

@@ -14,7 +14,7 @@ from colmap_tco import _pycolmap, model_files
 from colmap_tco._pycolmap import Model, Registered
 from colmap_tco.errors import InputError
 from colmap_tco.image_files import PICTURES, decoded_size, list_images, other_formats
-from colmap_tco.lens import warn_of_lenses
+from colmap_tco.lens import implausible
 from tco.config import knob
 
 log = logging.getLogger(__name__)
@@ -126,7 +126,7 @@ class Workspace:
         model_path: folder of the chosen model.
         model: the ``pycolmap.Reconstruction``.
         images: registered images whose files are usable, ordered by name.
-        reasons: sentences that say why these images and this model.
+        reasons: sentences that say why these images and this model, and what is to be doubted in it.
         skipped: name → why a registered image is not used.
         unregistered: name → why a picture in the image folder has no camera in this model.
     """
@@ -184,13 +184,15 @@ def open_workspace(
         )
     for reason in reasons:
         log.info("%s", reason)
-    warn_of_lenses(entries)
+    doubts = implausible(entries)
+    for doubt in doubts:
+        log.warning("%s", doubt)
     if skipped:
         log.warning("%d of %d images are skipped:\n%s", len(skipped), len(entries), listing(skipped))
     others = unregistered_images(root, folder, [entry.name for entry in entries], elsewhere, num_threads)
     if others:
         log.warning("%d pictures are not in the model:\n%s", len(others), listing(others))
-    return Workspace(root, folder, model_path, model, images, tuple(reasons), skipped, others)
+    return Workspace(root, folder, model_path, model, images, (*reasons, *doubts), skipped, others)
 
 
 def unregistered_images(

@@ -165,13 +165,18 @@ class ConsensusConfig:
         "where most surfaces of a scene face along three directions at right angles: most that it costs a "
         "pixel to be on a plane that does not; 0: such directions are not looked for",
     )
+    plane_colour: float = knob(
+        1.0,
+        "what it costs a pixel to keep a depth that is unsure, where sure pixels of its colour are on "
+        "planes: up to this many times the logarithm of how much rarer its colour is off them; 0: nothing",
+    )
 
     def __post_init__(self) -> None:
         if self.planes < 0 or not 0 < self.plane_share < 1:
             raise ValueError("planes must not be negative, and plane_share between 0 and 1")
         if self.plane_trust <= 0:
             raise ValueError("plane_trust must be positive")
-        check_range(self, "plane_smoothness plane_square", 0)
+        check_range(self, "plane_smoothness plane_square plane_colour", 0)
         if self.consensus_rounds < 0 or self.consensus_views < 1:
             raise ValueError("consensus_rounds must not be negative, and consensus_views at least 1")
         if not (self.consensus_reach > 0 and self.consensus_width > 0):

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks import quality, unseen
+from benchmarks import unseen
+from benchmarks.sets import known
 from benchmarks.unseen import COLOUR_BESIDE, COLOUR_CAMERA, DEPTH_CAMERA, is_stretch, made, registered
 from colmap_tco import _pycolmap
 
@@ -43,9 +44,9 @@ def test_the_nearest_of_what_falls_on_one_pixel_is_seen() -> None:
 def test_names_are_those_of_a_sequence_and_a_frame() -> None:
     assert is_stretch("icl-140") and is_stretch("redkitchen-000")
     assert not any(map(is_stretch, ("icl", "icl-", "kitchen", "hills-000", "icl--3")))
-    assert quality.known("icl-140") == "icl-140" and quality.known("kitchen") == "kitchen"
+    assert known("icl-140") == "icl-140" and known("kitchen") == "kitchen"
     with pytest.raises(argparse.ArgumentTypeError, match="attic is none of kitchen"):
-        quality.known("attic")
+        known("attic")
 
 
 def test_a_sequence_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

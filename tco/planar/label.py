@@ -38,11 +38,11 @@ relative error at which it is half of that."""
 SLANTED, REACH = (10.0, 25.0), 6.0
 """Degrees from a direction at which a surface begins to be slanted, and at which it is altogether; pixels to
 each side over which its normal is taken."""
-ELSEWHERE, CLEAR, VAGUE = 1.0, 0.5, 0.05
-"""For a pixel that keeps its depth: weight of how much rarer its colour is off all planes than in the view,
-in powers of e, of which so much does not count; the relative error of the depth at which half of that does.
-A plain door behind a table has the colours of the doors beside it, which are on a plane, whatever the network
-makes of it."""
+CLEAR, VAGUE = 0.5, 0.05
+"""Of how much rarer the colour of a pixel that keeps its depth is off all planes than in the view, in powers
+of e, so much does not count; the relative error of the depth at which half of the rest does. A plain door
+behind a table has the colours of the doors beside it, which are on a plane, whatever the network makes of
+it."""
 NEAR = 0.05
 """Relative error that larger ones count as where the colours of a plane are gathered: what is hardly known at
 all is near every plane."""
@@ -80,7 +80,7 @@ def labelled(
             on_any = np.maximum(on_any, near)
     if len(tried) == 1:
         return np.zeros(view.depth.shape, np.int64)
-    costs[0] = keep + cost_of_colour(view, colours, on_any)
+    costs[0] = keep + cost_of_colour(view, colours, on_any, config)
     unary, log_depth = (np.ascontiguousarray(np.stack(x, -1), np.float32) for x in (costs, logs))
     right, down = borders(view, config.plane_smoothness)
     chosen = least_labels(unary, log_depth, right, down, (STEP, CHANGE), SWEEPS)
@@ -105,19 +105,19 @@ def cost_of(
     return np.where(there, cost.clip(0, NEVER), NEVER).astype(np.float32), near
 
 
-def cost_of_colour(view: Shown, colours: Labels, on_any: Floats) -> Floats:
+def cost_of_colour(view: Shown, colours: Labels, on_any: Floats, config: ConsensusConfig) -> Floats:
     """What it costs (H, W) to keep a depth that is unsure, where sure pixels of that colour are on planes.
 
     Args:
         view: with its depths.
         colours: (H, W) bins.
         on_any: (H, W) how much a pixel is on one of the planes by its own depth, 0 to 1.
+        config: whose ``plane_colour`` is the weight.
     """
     rare = rarity(colours, view.sure.clip(0, CERTAIN) ** 2, 1 - on_any)[colours]
     unsure = (view.error / VAGUE) ** 2
-    return np.asarray(
-        ELSEWHERE * np.maximum(rare - CLEAR, 0) * unsure / (1 + unsure) * view.known, np.float32
-    )
+    cost = config.plane_colour * np.maximum(rare - CLEAR, 0) * unsure / (1 + unsure)
+    return np.asarray(cost * view.known, np.float32)
 
 
 def cost_of_facing(plane: Plane, frame: Frame, config: ConsensusConfig) -> float:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
 from colmap_tco import _pycolmap
 from colmap_tco._pycolmap import Registered
-from colmap_tco.lens import MOST, pincushion, warn_of_lenses
+from colmap_tco.check import CheckConfig, check
+from colmap_tco.lens import MOST, implausible, pincushion
+from colmap_tco.progress import Progress
+from colmap_tco.workspace import open_workspace
 
 SIZE = (640, 480)
 HALF_DIAGONAL = 400.0
@@ -38,16 +43,38 @@ def test_fisheye_lenses_are_barrels() -> None:
     assert pincushion(camera) < 0
 
 
-@pytest.mark.parametrize(("share", "warnings"), [(0.9, 0), (1.1, 1)])
-def test_only_more_than_lenses_have_is_warned_of(
-    share: float, warnings: int, caplog: pytest.LogCaptureFixture
+def images(*shares: float) -> list[Registered]:
+    """Two views by each camera, of these shares of the most that a lens may have."""
+    u, found = 0.45, []
+    for number, share in enumerate(shares, 1):
+        k = share * MOST / u**2
+        camera = radial(HALF_DIAGONAL / (u + k * u**3), u, k)
+        camera.camera_id = number
+        found += [Registered(2 * number + i, f"{number}-{i}.jpg", camera, None) for i in (0, 1)]  # type: ignore[arg-type]
+    return found
+
+
+def test_only_more_than_lenses_have_is_told_of() -> None:
+    assert implausible(images(0.9)) == []
+    (told,) = implausible(images(1.3))
+    assert told.startswith("1 of 1 cameras") and "camera 1 (SIMPLE_RADIAL) 6 % at the corners" in told
+
+
+def test_many_cameras_are_one_sentence_and_the_worst_is_named() -> None:
+    (told,) = implausible(images(0.2, 1.5, 2.0, 1.1, -3.0))
+    assert told.startswith("3 of 5 cameras") and "camera 3 (SIMPLE_RADIAL) 10 %" in told
+
+
+def test_opening_a_workspace_and_checking_it_warn_and_the_report_keeps_it(
+    make_workspace: Callable[..., Path], tmp_path: Path, caplog: pytest.LogCaptureFixture, shot: type
 ) -> None:
-    """Once a camera, however many views it has."""
-    u = 0.45
-    k = share * MOST / u**2
-    camera = radial(HALF_DIAGONAL / (u + k * u**3), u, k)
-    images = [Registered(i, f"{i}.jpg", camera, None) for i in (1, 2)]  # type: ignore[arg-type]
+    """A strong pincushion in a model that is otherwise consistent; a plain one says nothing."""
+    plain = open_workspace(make_workspace(tmp_path / "plain"))
+    assert not caplog.records and not any("pincushion" in reason for reason in plain.reasons)
+    bent = shot(params=(110.0, 80.0, 60.0, 0.5))
+    root = make_workspace(tmp_path / "bent", (bent,) * 5)
     with caplog.at_level(logging.WARNING):
-        warn_of_lenses(images)
-    assert len(caplog.records) == warnings
-    assert all("pincushion" in record.message for record in caplog.records)
+        opened = open_workspace(root)
+    assert [r.message for r in caplog.records] == [r for r in opened.reasons if "pincushion" in r]
+    assert len(caplog.records) == 1
+    assert "pincushion" in check(root, CheckConfig(), Progress()).images

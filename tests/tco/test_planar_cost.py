@@ -17,7 +17,6 @@ from tco.planar.fit import refit
 from tco.planar.label import (
     CERTAIN,
     CLEAR,
-    ELSEWHERE,
     MOST_UNLIKE,
     NEVER,
     SHRINK,
@@ -35,6 +34,8 @@ from tco.types import Prediction
 SLOPE = 0.3
 NORMAL, OFFSET = np.array([-SLOPE, 0, 1]) / math.hypot(SLOPE, 1), 2 / math.hypot(SLOPE, 1)
 CONFIG = ConsensusConfig()
+WEIGHT = 1.7
+"""Of colours where a depth is kept, in the tests of its cost."""
 KNOWN = Plane(NORMAL.astype(np.float32), OFFSET, np.zeros(3), np.eye(3)[:2], np.zeros((3, 3)))
 
 
@@ -60,7 +61,8 @@ def cost(view: Shown) -> Floats:
 def cost_of_keeping_on_colour(view: Shown) -> Floats:
     """Beside the wall's own plane as the only one."""
     colours = colour_bins(view)
-    return cost_of_colour(view, colours, cost_of(view, KNOWN, KNOWN.depth(view), colours, CONFIG)[1])
+    on_it = cost_of(view, KNOWN, KNOWN.depth(view), colours, CONFIG)[1]
+    return cost_of_colour(view, colours, on_it, replace(CONFIG, plane_colour=WEIGHT))
 
 
 def plain(view: Shown) -> Shown:
@@ -132,7 +134,7 @@ def test_a_depth_of_a_colour_that_is_on_planes_elsewhere_costs_by_how_unsure_it_
         every = (pixels - 60 * 30 - unsure) * CERTAIN**2 + off
         ratio = (off + SHRINK * every) / (off + red + SHRINK * (every + red)) * (every + red) / every
         times = (ERROR / sure / VAGUE) ** 2
-        expected = ELSEWHERE * (min(-math.log(ratio), MOST_UNLIKE) - CLEAR) * times / (1 + times)
+        expected = WEIGHT * (min(-math.log(ratio), MOST_UNLIKE) - CLEAR) * times / (1 + times)
         np.testing.assert_allclose(found[rows, columns], expected, rtol=0.05)
         assert found[30:70, 15:35].max() == 0.0
 
@@ -155,6 +157,8 @@ def test_an_unsure_depth_goes_to_the_plane_that_has_its_colour(door: tuple[Shown
     red = labelled(replace(view, image=image), [KNOWN], config)
     assert (grey[rows, columns] == 1).all() and (grey[25:75, 15:35] == 0).all()
     assert (red[rows, columns] == 0).all()
+    deaf = labelled(view, [KNOWN], replace(config, plane_colour=0.0))
+    assert (deaf[rows, columns] == 0).all()
 
 
 def test_where_there_is_no_depth_the_plane_cannot_be(scene: Wall) -> None:
