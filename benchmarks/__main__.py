@@ -18,6 +18,7 @@ from pathlib import Path
 
 from benchmarks.rendered import SCENES
 from benchmarks.tables import FIRST, marks
+from benchmarks.unseen import UNTUNED
 from colmap_tco.published import NETWORKS
 from colmap_tco.resume import fingerprint
 from colmap_tco.weights import located
@@ -51,10 +52,6 @@ class Table:
 
 
 _ALL = ("--sets", "kitchen", "office", "livingroom", *SCENES)
-_UNTUNED = (
-    "redkitchen-075", "redkitchen-200", "redkitchen-380", "redkitchen-530", "redkitchen-560",
-    "redkitchen-920", "hololens-045", "hololens-060", "icl-060", "icl-120",
-)  # fmt: skip
 _RENDERED = ("--sets", *SCENES)
 _TWO, _THREE = ("--seeds", "2"), ("--seeds", "3")
 
@@ -68,7 +65,11 @@ TABLES = (
     Table("quality-640", "quality", "quality.md",
           ("--baselines", "--steps", "0", "5", "--max_image_size", "640"), "640 pixels"),
     Table("quality-untuned", "quality", "quality.md",
-          ("--sets", *_UNTUNED, "--baselines", "interp", "patchmatch"), "scenes not tuned on"),
+          ("--sets", *UNTUNED, "--baselines", "interp", "patchmatch"), "scenes not tuned on"),
+    Table("quality-colour", "quality", "quality.md",
+          ("--sets", *UNTUNED, "--baselines", "--steps", "5", "--plane_colour", "0"),
+          "colours of kept depths aside"),
+    Table("stretches", "unseen", "quality.md", (), "stretches"),
     Table("quality-steps", "quality", "quality.md",
           ("--baselines", "--steps", "10", "20", "40"), "more steps"),
     Table("quality-seed", "quality", "quality.md",

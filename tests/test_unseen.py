@@ -16,6 +16,7 @@ from benchmarks import unseen
 from benchmarks.sets import known
 from benchmarks.unseen import COLOUR_BESIDE, COLOUR_CAMERA, DEPTH_CAMERA, is_stretch, made, registered
 from colmap_tco import _pycolmap
+from colmap_tco.lens import pincushion
 
 
 @pytest.mark.parametrize(("x", "y", "z"), [(320, 240, 1000), (100, 400, 700), (600, 50, 4000)])
@@ -47,6 +48,12 @@ def test_names_are_those_of_a_sequence_and_a_frame() -> None:
     assert known("icl-140") == "icl-140" and known("kitchen") == "kitchen"
     with pytest.raises(argparse.ArgumentTypeError, match="attic is none of kitchen"):
         known("attic")
+
+
+def test_what_was_looked_at_is_not_among_what_nothing_was_chosen_by() -> None:
+    assert not set(unseen.UNTUNED) & set(unseen.LOOKED_AT)
+    assert len(set(unseen.MAPPED)) == len(unseen.MAPPED) and all(map(is_stretch, unseen.MAPPED))
+    assert unseen.parser().parse_args([]).names == list(unseen.MAPPED)
 
 
 def test_a_sequence_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -86,6 +93,10 @@ def test_frames_become_a_workspace_with_its_truth(
     assert told == {"model": "sparse/0", "metres_per_colmap_unit": pytest.approx(0.25, rel=0.01), "images": 5}
     assert [file.name for file in sorted((folder / "images").iterdir())] == names
     assert unseen.agreeing(folder) == pytest.approx(2 / 3, abs=0.03)
+    cells = [cell.strip() for cell in unseen.row("made-0", folder).split("|")]
+    cameras = [e.camera for e in _pycolmap.registered(_pycolmap.read_model(given / "sparse" / "0"))]
+    assert cells[1:3] == ["made-0", "5"] and float(cells[3]) == pytest.approx(2 / 3, abs=0.03)
+    assert float(cells[4]) == pytest.approx(100 * max(map(pincushion, cameras)), abs=0.06)
     truth = cv2.imread(str(folder / "gt" / "depth" / names[1]), cv2.IMREAD_UNCHANGED)
     assert truth[0].max() == 0 and truth.max() > 0
     monkeypatch.setattr(unseen, "FEWEST", 6)
