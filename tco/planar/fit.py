@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from tco.options import ConsensusConfig
+from tco.planar._costs import votes
 from tco.planar.frame import TILT, Frame
 from tco.planar.view import Bools, Floats, Labels, Plane, Shown, guessed, normals, within
 
@@ -52,11 +53,10 @@ class _Pixels:
         )  # fmt: skip
 
     @staticmethod
-    def of(view: Shown, on: Bools | Labels, normals: Floats) -> _Pixels:
-        """Some of a view's pixels, whose normals are given."""
-        points, directions = view.points.reshape(-1, 3)[on], view.directions.reshape(-1, 3)[on]
-        depth, error, sure = view.depth.ravel()[on], view.error.ravel()[on], view.sure.ravel()[on]
-        return _Pixels(points, normals, directions, depth, error, sure.clip(0, SURE))
+    def of(view: Shown, on: Labels, normals: Floats) -> _Pixels:
+        """Some of a view's pixels, by flat indices, whose normals are given."""
+        part = view.at(on)
+        return _Pixels(part.points, normals, part.directions, part.depth, part.error, part.sure.clip(0, SURE))
 
     @staticmethod
     def joined(parts: Sequence[_Pixels]) -> _Pixels:
@@ -65,19 +65,20 @@ class _Pixels:
         return _Pixels(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
     def across(self, normal: Floats) -> Floats:
-        """Length along n, (N,) or (N, P), by which a relative error of depth of 1 is off a plane."""
-        depth = self.depth if normal.ndim == 1 else self.depth[:, None]
-        return np.asarray(depth * np.abs(self.directions @ normal).clip(GRAZING))
+        """Length along n, (N,), by which a relative error of depth of 1 is off a plane."""
+        return np.asarray(self.depth * np.abs(self.directions @ normal).clip(GRAZING))
 
-    def near(self, normal: Floats, offset: Floats | float, times: float = 1.0) -> Bools:
-        """Which pixels (N,) are on a plane (3,), or (N, P) on planes (3, P), by place and by normal."""
-        share = (bounded(self.error) - LEAST) / (MOST - LEAST)
-        least = np.cos(np.radians(ANGLES[0] + (ANGLES[1] - ANGLES[0]) * share))
-        allowed = times * bounded(self.error)
-        if normal.ndim == 2:
-            least, allowed = least[:, None], allowed[:, None]
+    def near(self, normal: Floats, offset: float, times: float = 1.0) -> Bools:
+        """Which pixels (N,) are on a plane, by place and by normal."""
         far = np.abs(self.points @ normal - offset)
-        return np.asarray((far < allowed * self.across(normal)) & (self.normals @ normal > least))
+        close = far < times * bounded(self.error) * self.across(normal)
+        return np.asarray(close & (self.normals @ normal > self.least_cosine))
+
+    @property
+    def least_cosine(self) -> Floats:
+        """Least cosine (N,) between the normals of a pixel and of its plane."""
+        share = (bounded(self.error) - LEAST) / (MOST - LEAST)
+        return np.asarray(np.cos(np.radians(ANGLES[0] + (ANGLES[1] - ANGLES[0]) * share)))
 
 
 def bounded(error: Floats) -> Floats:
@@ -125,9 +126,17 @@ def _best(pixels: _Pixels, rng: np.random.Generator) -> tuple[Floats, float]:
     drawn = pixels[rng.choice(len(chance), DRAWN, p=chance / chance.sum())]
     judges = pixels[rng.permutation(len(chance))[:JUDGES]]
     offsets = (drawn.points * drawn.normals).sum(-1)
-    votes = judges.weight @ judges.near(drawn.normals.T, offsets)
-    first = int(votes.argmax())
+    first = int(votes_for(judges, drawn.normals, offsets).argmax())
     return drawn.normals[first], float(offsets[first])
+
+
+def votes_for(pixels: _Pixels, normals: Floats, offsets: Floats) -> Floats:
+    """Sum of the weights of the pixels near each of P planes, (P,), of normals (P, 3) and offsets (P,)."""
+    rows = *pixels.points.T, *pixels.normals.T, *pixels.directions.T, bounded(pixels.error) * pixels.depth
+    asked = np.stack([*rows, pixels.least_cosine, pixels.weight], dtype=np.float32)
+    found = np.empty(len(offsets), np.float32)
+    votes(asked, np.column_stack([normals, offsets]).astype(np.float32), np.float32(GRAZING), found)
+    return found
 
 
 def _robust(pixels: _Pixels, normal: Floats, offset: float) -> tuple[Floats, float, Bools]:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from tco.options import ConsensusConfig
+from tco.planar._costs import add_by_colour, histograms, on_own_depth
 from tco.planar._kernels import least_labels
 from tco.planar.frame import Frame
 from tco.planar.view import SIDE, Floats, Labels, Plane, Shown, normals, span
 
+f32 = np.float32
 WIDE = 2.0
 """A plane that departs from a depth by this many times its error costs half of ``plane_trust``."""
 LEAST, MOST = 0.01, 1.0
@@ -65,44 +68,60 @@ def labelled(
         config: how much depths are trusted, and how much borders cost.
         frame: directions, if the scene has any, along which surfaces are likelier to face.
     """
+    if not planes:
+        return np.zeros(view.depth.shape, np.int64)
     colours = colour_bins(view)
     keep = np.zeros_like(view.depth) if frame is None else cost_of_keeping(view, frame, config)
-    tried, costs, logs, on_any = [0], [keep], [np.log(view.depth)], np.zeros_like(view.depth)
-    for k, plane in enumerate(planes):
-        depth = plane.depth(view)
-        cost, near = cost_of(view, plane, depth, colours, config)
-        if frame is not None:
-            cost = np.minimum(cost + cost_of_facing(plane, frame, config), NEVER)
-        if ((cost < WORTH * config.plane_trust) & (cost < NEVER)).mean() >= FEW:
-            tried.append(k + 1)
-            costs.append(cost)
-            logs.append(np.log(np.where(depth > 0, depth, 1)))
-            on_any = np.maximum(on_any, near)
-    if len(tried) == 1:
+    taking = costs_of(view, planes, colours, config)
+    if frame is not None:
+        facing = [cost_of_facing(plane, frame, config) for plane in planes]
+        taking.cost[:] = np.minimum(taking.cost + np.asarray(facing, np.float32)[:, None, None], NEVER)
+    tried = (taking.cost < min(WORTH * config.plane_trust, NEVER)).mean((1, 2)) >= FEW
+    if not tried.any():
         return np.zeros(view.depth.shape, np.int64)
-    costs[0] = keep + cost_of_colour(view, colours, on_any, config)
-    unary, log_depth = (np.ascontiguousarray(np.stack(x, -1), np.float32) for x in (costs, logs))
+    keep = keep + cost_of_colour(view, colours, taking.near[tried].max(0), config)
+    unary = np.stack([keep, *taking.cost[tried]], -1, dtype=np.float32)
+    log_depth = np.stack([np.log(view.depth), *taking.log_depth[tried]], -1, dtype=np.float32)
+    del taking
     right, down = borders(view, config.plane_smoothness)
     chosen = least_labels(unary, log_depth, right, down, (STEP, CHANGE), SWEEPS)
-    return np.asarray(tried)[chosen]
+    return np.concatenate([[0], 1 + np.flatnonzero(tried)])[chosen]
 
 
-def cost_of(
-    view: Shown, plane: Plane, depth: Floats, colours: Labels, config: ConsensusConfig
-) -> tuple[Floats, Floats]:
-    """What it costs to take a plane, of these depths, instead of keeping one's own.
+@dataclass(frozen=True)
+class Taking:
+    """What it costs a view's pixels to take each of K planes, instead of keeping their depths.
 
-    Returns:
-        The cost (H, W); and how much a pixel is on the plane by its own depth, (H, W) 0 to 1.
+    Attributes:
+        cost: (K, H, W), ``NEVER`` where there is no depth or the plane is behind the camera.
+        log_depth: (K, H, W) logarithm of the planes' depths, 0 there.
+        near: (K, H, W) how much a pixel is on the plane by its own depth, 0 to 1.
     """
-    there = (depth > 0) & view.known
-    off = np.where(there, np.log(np.where(there, depth, 1) / view.depth), 0)
-    apart = (off / (WIDE * view.error).clip(LEAST, MOST)) ** 2
-    cost = config.plane_trust * apart / (1 + apart)
-    cost += DOUBT * (plane.error(view, depth) / UNSURE) ** 2
-    near = np.exp(-0.5 * (off / view.error.clip(LEAST / WIDE, NEAR)) ** 2) * there
-    cost += UNLIKE * rarity(colours, view.sure.clip(0, CERTAIN) ** 2, near)[colours]
-    return np.where(there, cost.clip(0, NEVER), NEVER).astype(np.float32), near
+
+    cost: Floats
+    log_depth: Floats
+    near: Floats
+
+
+def costs_of(view: Shown, planes: Sequence[Plane], colours: Labels, config: ConsensusConfig) -> Taking:
+    """Costs of planes by their departures from the depths, by their own errors and by the colours on them.
+
+    Args:
+        view: with its depths.
+        planes: K of them.
+        colours: (H, W) bins.
+        config: how much depths are trusted.
+    """
+    off = (WIDE * view.error).clip(LEAST, MOST), view.error.clip(LEAST / WIDE, NEAR)
+    rows = *np.moveaxis(view.directions, -1, 0), np.where(view.known, view.depth, 0), np.log(view.depth), *off
+    pixels = np.stack([row.ravel() for row in rows], dtype=np.float32)
+    packed = np.stack([plane.packed(view.centre) for plane in planes])
+    cost, log_depth, near = (np.empty((len(planes), pixels.shape[1]), np.float32) for _ in range(3))
+    on_own_depth(pixels, packed, (f32(config.plane_trust), f32(DOUBT / UNSURE**2)), cost, log_depth, near)
+    near = near.reshape(-1, *view.depth.shape)
+    rare = (UNLIKE * rarity(colours, view.sure.clip(0, CERTAIN) ** 2, near)).astype(np.float32)
+    add_by_colour(colours.ravel(), rare, f32(NEVER), cost)
+    return Taking(cost.reshape(near.shape), log_depth.reshape(near.shape), near)
 
 
 def cost_of_colour(view: Shown, colours: Labels, on_any: Floats, config: ConsensusConfig) -> Floats:
@@ -114,7 +133,7 @@ def cost_of_colour(view: Shown, colours: Labels, on_any: Floats, config: Consens
         on_any: (H, W) how much a pixel is on one of the planes by its own depth, 0 to 1.
         config: whose ``plane_colour`` is the weight.
     """
-    rare = rarity(colours, view.sure.clip(0, CERTAIN) ** 2, 1 - on_any)[colours]
+    rare = rarity(colours, view.sure.clip(0, CERTAIN) ** 2, 1 - on_any[None])[0, colours]
     unsure = (view.error / VAGUE) ** 2
     cost = config.plane_colour * np.maximum(rare - CLEAR, 0) * unsure / (1 + unsure)
     return np.asarray(cost * view.known, np.float32)
@@ -146,26 +165,25 @@ def colour_bins(view: Shown) -> Labels:
 
 
 def rarity(colours: Labels, sure: Floats, near: Floats) -> Floats:
-    """By how much rarer colours are on a plane than in the view, per bin (BINS³,), 0 if not, in powers of e.
+    """By how much rarer colours are on planes than in the view, (K, BINS³), 0 if not, in powers of e.
 
-    The chance of a colour on the plane is shrunk to that in the view where little of the plane is seen.
+    The chance of a colour on a plane is shrunk to that in the view where little of the plane is seen.
 
     Args:
         colours: (H, W) bins.
         sure: (H, W) weights.
-        near: (H, W) how much a pixel is on the plane by its own depth, 0 to 1.
+        near: (K, H, W) how much a pixel is on each of K planes by its own depth, 0 to 1.
     """
-    total = max(float(sure.sum()), 1e-9)
-    every, here = (_histogram(colours, weight / total) for weight in (sure, sure * near))
-    share = float(here.sum())
+    flat, weight = colours.ravel(), sure.ravel().astype(np.float64)
+    weight /= max(float(weight.sum()), 1e-9)
+    counts = np.zeros((1 + len(near), BINS**3))
+    counts[0] = np.bincount(flat, weight, BINS**3)
+    histograms(flat, weight.astype(np.float32), near.reshape(len(near), -1), counts[1:])
+    blurred = gaussian_filter(counts.reshape(-1, BINS, BINS, BINS), (0, 0.7, 0.7, 0.7), mode="reflect")
+    every, here = np.split(blurred.reshape(counts.shape), [1])
+    share = here.sum(1, keepdims=True)
     ratio = (here + SHRINK * every) / (share + SHRINK) / every.clip(1e-9)
     return np.where(every > 1e-6, -np.log(ratio.clip(1e-9)), 0).clip(0, MOST_UNLIKE)
-
-
-def _histogram(colours: Labels, weights: Floats) -> Floats:
-    """Sums of weights (H, W) per bin, blurred a little, (BINS³,)."""
-    counts = np.bincount(colours.ravel(), weights.ravel().astype(np.float64), BINS**3)
-    return np.asarray(gaussian_filter(counts.reshape(BINS, BINS, BINS), 0.7, mode="reflect").ravel())
 
 
 def borders(view: Shown, smoothness: float) -> tuple[Floats, Floats]:

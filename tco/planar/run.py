@@ -114,13 +114,13 @@ def flattened(
     shared = math.ceil(math.sqrt(count / SHARED))
     bound = math.ceil(math.sqrt(math.prod(views.size) / (LARGEST / 2)))
     stride = min(max(2, shared, bound), min(views.size) // SMALLEST)
-    some = [show(i, stride) for i in range(count)]
-    frame = None
-    if config.plane_square > 0:
-        frame = frame_of(some, planes, [edges(show(i)) for i in range(count)])
-    if frame is not None:
-        planes += hinged(some, frame, planes)
     with ThreadPoolExecutor(min(torch.get_num_threads(), WORKERS)) as pool:
+        some = list(pool.map(lambda i: show(i, stride), range(count)))
+        frame = None
+        if config.plane_square > 0:
+            frame = frame_of(some, planes, list(pool.map(lambda i: edges(show(i)), range(count))))
+        if frame is not None:
+            planes += hinged(some, frame, planes)
         for _ in range(ROUNDS):
             labels = list(pool.map(partial(labelled, planes=planes, config=config, frame=frame), some))
             planes = refit(some, labels, planes, config, frame)
@@ -146,13 +146,14 @@ def _view_on_planes(
     if stride > 1:
         rows, columns = (np.minimum(np.arange(n) // stride, n // stride - 1) for n in view.depth.shape)
         label = label[rows[:, None], columns]
-    label = np.where(view.known, label, 0)
+    label = np.where(view.known, label, 0).ravel()
     depth = agreement.prediction.depth[i].clone()
     error = torch.full_like(depth, torch.inf)
     for k, plane in enumerate(planes):
-        there = plane.depth(view)
-        on = (label == k + 1) & (there > 0)
-        label[(label == k + 1) & ~on] = 0
-        depth[on] = torch.from_numpy(there[on]).to(depth)
-        error[on] = torch.from_numpy(plane.error(view, there)[on]).to(error)
-    return depth, error, torch.from_numpy(label)
+        on = np.flatnonzero(label == k + 1)
+        there = plane.depth(view.at(on))
+        label[on[there == 0]] = 0
+        on, there = on[there > 0], there[there > 0]
+        depth.view(-1)[on] = torch.from_numpy(there).to(depth)
+        error.view(-1)[on] = torch.from_numpy(plane.error(view.at(on), there)).to(error)
+    return depth, error, torch.from_numpy(label).reshape(depth.shape)

@@ -45,6 +45,12 @@ class Shown:
     directions: Floats
     centre: Floats
 
+    def at(self, pixels: Labels) -> Shown:
+        """Some of its pixels, by their flat indices (N,): all of (H, W) is then of (N,)."""
+        depth, sure = (part.ravel()[pixels] for part in (self.depth, self.sure))
+        image, directions = (part.reshape(-1, 3)[pixels] for part in (self.image, self.directions))
+        return Shown(depth, sure, self.known.ravel()[pixels], image, directions, self.centre)
+
     @property
     def points(self) -> Floats:
         """(H, W, 3) in the world."""
@@ -136,13 +142,23 @@ class Plane:
 
     def error(self, view: Shown, depth: Floats) -> Floats:
         """Relative standard error (H, W) of these depths of the plane, by its covariance."""
+        turned, shift = self._errors(view.centre)
+        parts = view.directions * depth[..., None] @ turned + shift
+        along = np.abs(view.directions @ self.normal).clip(1e-6)
+        return np.sqrt(np.einsum("...i,...i", parts, parts)) / along / depth.clip(1e-6)
+
+    def _errors(self, centre: Floats) -> tuple[Floats, Floats]:
+        """Matrix (3, 3) and offsets (3,) of what has the plane's error as length, by places from a centre."""
         values, vectors = np.linalg.eigh(self.covariance)
         root = vectors * np.sqrt(values.clip(0))  # root @ root.T is the covariance
         turned = self.axes.T @ root[:2]
-        points = view.centre + view.directions * depth[..., None]
-        parts = points @ turned.astype(points.dtype) + (root[2] - self.centre @ turned).astype(points.dtype)
-        along = np.abs(view.directions @ self.normal).clip(1e-6)
-        return np.sqrt(np.einsum("...i,...i", parts, parts)) / along / depth.clip(1e-6)
+        return turned.astype(np.float32), (root[2] - (self.centre - centre) @ turned).astype(np.float32)
+
+    def packed(self, centre: Floats) -> Floats:
+        """All of it as a camera at a centre sees it, (16,) float32, as :mod:`tco.planar._costs` takes it."""
+        turned, shift = self._errors(centre)
+        away = self.offset - centre @ self.normal
+        return np.concatenate([self.normal, [away], turned.T.ravel(), shift], dtype=np.float32)
 
 
 def guessed(normal: Floats, offset: float, centre: Floats, tilt: float, sigma: float) -> Plane:

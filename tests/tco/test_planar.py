@@ -16,10 +16,10 @@ from tco.consensus import Agreement, agreed
 from tco.options import ConsensusConfig
 from tco.planar import run
 from tco.planar._kernels import least_labels
-from tco.planar.fit import ALIKE, LEAST, find, refit
+from tco.planar.fit import ALIKE, LEAST, _Pixels, find, refit, votes_for
 from tco.planar.label import ACROSS, BINS, MOST_UNLIKE, borders, labelled, rarity
 from tco.planar.run import flattened, together
-from tco.planar.view import ERROR, SIDE, Floats, Labels, Plane, Shown, shown
+from tco.planar.view import ERROR, SIDE, Floats, Labels, Plane, Shown, normals, shown
 from tco.toy import Wall, wall
 from tco.types import Cameras, Prediction, Views
 
@@ -91,6 +91,16 @@ def test_labels_have_the_least_energy(shape: tuple[int, int], seed: int) -> None
     assert found == pytest.approx(least, rel=1e-5 if 1 in shape else 0.03)
 
 
+@pytest.mark.parametrize("labels", [1, 7, 8, 9])
+def test_any_number_of_labels_will_do(labels: int) -> None:
+    """Loops are over a multiple of eight; what is added to have that is never taken."""
+    problem = puzzle(3, (1, 4), labels)
+    found = least_labels(*problem, TERMS, 20)
+    every = itertools.product(range(labels), repeat=4)
+    least = min(energy(np.array(each).reshape(1, 4), *problem) for each in every)
+    assert energy(found, *problem) == pytest.approx(least, rel=1e-5)
+
+
 def test_a_plane_costs_nothing_within_and_a_surface_its_steps() -> None:
     """Two labels with the same steep depths: without costs of their own the plane is taken everywhere."""
     logs = np.repeat(0.05 * np.arange(8, dtype=np.float32)[None, :, None], 2, -1).repeat(5, 0)
@@ -128,6 +138,20 @@ def test_error_of_a_plane_is_the_spread_of_its_depth(scene: Wall) -> None:
         depths.append(replace(plane, normal=normal, offset=offset).depth(view))
     spread = np.std(depths, 0) / plane.depth(view)
     assert np.allclose(plane.error(view, plane.depth(view)), spread, rtol=0.06)
+
+
+def test_pixels_vote_for_the_planes_that_they_are_on(scene: Wall) -> None:
+    """The compiled sums are those of ``near``."""
+    view = seen(scene, noisy(scene, 0.02), 3.0)[0]
+    rng, n = np.random.default_rng(4), normals(view)
+    pick = np.flatnonzero((n != 0).any(-1))
+    pixels = _Pixels.of(view, pick, n.reshape(-1, 3)[pick])
+    planes = pixels[rng.choice(len(pick), 40)]
+    offsets = (planes.points * planes.normals).sum(-1) + rng.normal(0, 0.02, 40)
+    found = votes_for(pixels, planes.normals, offsets)
+    for normal, offset, votes in zip(planes.normals, offsets, found, strict=True):
+        assert votes == pytest.approx(float(pixels.weight @ pixels.near(normal, offset)), rel=2e-3)
+    assert found.min() < 0.5 * found.max()
 
 
 def test_the_wall_is_found_among_outliers(scene: Wall) -> None:
@@ -288,12 +312,11 @@ def test_colours_that_are_not_on_the_plane_are_rare_there() -> None:
     colours = np.zeros((4, 8), np.int64)
     red, blue = (BINS - 1) * BINS**2, BINS - 1
     colours[:, :4], colours[:, 4:] = red, blue
-    near = (colours == red).astype(np.float64)
-    found = rarity(colours, np.ones((4, 8)), near)
+    near = (colours == red).astype(np.float32)
+    found, hardly = rarity(colours, np.ones((4, 8)), np.stack([near, 1e-5 * near]))
     assert found[red] == 0
     assert found[blue] == MOST_UNLIKE
-    hardly = rarity(colours, np.ones((4, 8)), 1e-6 * near)
-    assert hardly[blue] < 1e-3
+    assert 0 < hardly[blue] < 1e-2
 
 
 def test_borders_follow_the_picture_and_spare_what_has_no_depth(scene: Wall) -> None:
@@ -392,8 +415,9 @@ def test_what_is_no_number_harms_its_own_pixels_alone(scene: Wall) -> None:
 def test_colours_that_nothing_sure_shows_are_not_rare() -> None:
     colours = np.array([[0, BINS**3 - 1]])
     sure = np.array([[1.0, 0.0]])
-    assert (rarity(colours, sure, np.ones((1, 2)))[colours] == 0).all()
-    assert (rarity(colours, np.zeros((1, 2)), np.ones((1, 2))) == 0).all()
+    near = np.ones((1, 1, 2), np.float32)
+    assert (rarity(colours, sure, near)[0, colours] == 0).all()
+    assert (rarity(colours, np.zeros((1, 2)), near) == 0).all()
 
 
 def test_a_plane_behind_the_camera_is_never_taken() -> None:

@@ -17,17 +17,23 @@ from tco.planar.fit import refit
 from tco.planar.label import (
     CERTAIN,
     CLEAR,
+    DOUBT,
+    LEAST,
+    MOST,
     MOST_UNLIKE,
+    NEAR,
     NEVER,
     SHRINK,
     UNLIKE,
+    UNSURE,
     VAGUE,
+    WIDE,
     colour_bins,
-    cost_of,
     cost_of_colour,
+    costs_of,
     labelled,
 )
-from tco.planar.view import ERROR, Floats, Plane, Shown, shown
+from tco.planar.view import ERROR, Floats, Plane, Shown, shown, within
 from tco.toy import Wall, wall
 from tco.types import Prediction
 
@@ -55,19 +61,57 @@ def seen(scene: Wall, depth: Tensor, confidence: Tensor | None = None) -> list[S
 
 def cost(view: Shown) -> Floats:
     """Of the wall's own plane, which is known exactly."""
-    return cost_of(view, KNOWN, KNOWN.depth(view), colour_bins(view), CONFIG)[0]
+    return costs_of(view, [KNOWN], colour_bins(view), CONFIG).cost[0]
 
 
 def cost_of_keeping_on_colour(view: Shown) -> Floats:
     """Beside the wall's own plane as the only one."""
     colours = colour_bins(view)
-    on_it = cost_of(view, KNOWN, KNOWN.depth(view), colours, CONFIG)[1]
+    on_it = costs_of(view, [KNOWN], colours, CONFIG).near[0]
     return cost_of_colour(view, colours, on_it, replace(CONFIG, plane_colour=WEIGHT))
 
 
 def plain(view: Shown) -> Shown:
     """Of one colour."""
     return replace(view, image=np.full_like(view.image, 0.5))
+
+
+def some_planes(seed: int, count: int) -> list[Plane]:
+    """Anywhere before, beside and behind the cameras, with any covariance."""
+    rng, found = np.random.default_rng(seed), []
+    for _ in range(count):
+        normal, centre = rng.standard_normal(3), rng.standard_normal(3) + (0, 0, 1)
+        normal = (normal / np.linalg.norm(normal)).astype(np.float32)
+        root = 0.05 * rng.standard_normal((3, 3))
+        found.append(Plane(normal, float(normal @ centre), centre, within(normal), root @ root.T))
+    return found
+
+
+def test_costs_are_the_formula_of_departure_and_of_the_planes_own_error(scene: Wall) -> None:
+    """In float64, where all pixels are of one colour, which is rare on no plane."""
+    sure = torch.full_like(scene.depth, 1.3)
+    sure[3, :20] = 9.0
+    view = plain(seen(scene, scene.depth, sure)[3])
+    view = replace(view, known=view.known & (np.arange(128) > 3))
+    planes = some_planes(1, 12)
+    found = costs_of(view, planes, colour_bins(view), CONFIG)
+    exact = replace(view, directions=view.directions.astype(np.float64))
+    seen_from_behind = 0
+    for plane, cost, log_depth, near in zip(planes, found.cost, found.log_depth, found.near, strict=True):
+        depth = plane.depth(exact).astype(np.float64)
+        there = (depth > 0) & view.known
+        seen_from_behind += int((depth == 0).sum())
+        assert (cost[~there] == NEVER).all() and (log_depth[~there] == 0).all() and (near[~there] == 0).all()
+        off = np.log(np.where(there, depth, 1) / view.depth)
+        apart = (off / (WIDE * view.error).clip(LEAST, MOST)) ** 2
+        expected = CONFIG.plane_trust * apart / (1 + apart)
+        expected += DOUBT * (plane.error(exact, np.where(there, depth, 1)) / UNSURE) ** 2
+        there &= depth < 20  # beyond that a ray is along the plane, and float32 too little
+        np.testing.assert_allclose(log_depth[there], np.log(depth[there]), atol=1e-4)
+        np.testing.assert_allclose(cost[there], expected.clip(0, NEVER)[there], rtol=1e-3, atol=1e-4)
+        width = view.error.clip(LEAST / WIDE, NEAR)
+        np.testing.assert_allclose(near[there], np.exp(-0.5 * (off / width) ** 2)[there], atol=2e-3)
+    assert 0 < seen_from_behind < 0.9 * 12 * view.depth.size
 
 
 @pytest.mark.parametrize("factor", [1.5, 5.0])
