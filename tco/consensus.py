@@ -34,7 +34,7 @@ from torch import Tensor
 
 from tco.geometry import invert, pixel_grid, project, rays, sample, transform
 from tco.options import ConsensusConfig
-from tco.parallel import in_ranges
+from tco.parallel import in_ranges, side_by_side
 from tco.polish import too_uncertain
 from tco.schedule import most_overlapping
 from tco.types import Cameras, Prediction, Priors, Views
@@ -99,7 +99,8 @@ def agreed(
     """
     if len(prediction.depth) != len(views):
         raise ValueError(f"all {len(views)} views must be predicted to agree, not {len(prediction.depth)}")
-    if priors.overlap is None:
+    overlap = priors.overlap
+    if overlap is None:
         raise ValueError("which views to ask is not known: there is no overlap among the priors")
     error = torch.full_like(prediction.depth, math.inf)
     if config.consensus_rounds == 0 or len(views) < 2:
@@ -116,12 +117,15 @@ def agreed(
     evidence = torch.stack([1 / depth, prediction.confidence, counts], -1 if loops else 1)
     ask = _asked_in_loops if loops else _asked
     moved = prediction.depth.clone()
-    for view in views.wanted:
-        others = most_overlapping(priors.overlap, view, config.consensus_views)
+
+    def move(view: int) -> None:
+        others = most_overlapping(overlap, view, config.consensus_views)
         if others:
             asked, spread = ask(evidence, cameras, view, others, config)
             moved[view] = asked.where(known[view], moved[view])
             error[view] = spread.where(known[view], error[view])
+
+    side_by_side(move, views.wanted, depth.device)
     return Agreement(replace(prediction, depth=moved, stages=()), error)
 
 

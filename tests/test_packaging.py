@@ -82,7 +82,7 @@ def test_the_wheel_holds_every_module_and_the_weights_and_nothing_else(wheel: zi
 
 def test_the_wheel_installs_the_command(wheel: zipfile.ZipFile) -> None:
     (name,) = (name for name in wheel.namelist() if name.endswith("entry_points.txt"))
-    assert "colmap-tco = colmap_tco.cli:main" in wheel.read(name).decode()
+    assert "colmap-tco = colmap_tco.__main__:run" in wheel.read(name).decode()
 
 
 def imported(path: Path) -> set[str]:

@@ -24,8 +24,8 @@ Labels = NDArray[np.int64]
 f32, ONE = np.float32, np.float32(1)
 
 LANES = 8
-"""Labels are made a multiple of this many, so that their loops are vector instructions without a rest. What is
-added changes, and nothing asks for it."""
+"""Labels are made a multiple of this many, so that their loops are vector instructions without a rest. What
+is added changes, and nothing asks for it."""
 ORDER = {"nnan", "nsz"}
 """The compiler may take the least of numbers in any order; there is no NaN among them."""
 

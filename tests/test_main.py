@@ -1,0 +1,52 @@
+"""How the program ends: at once, but not before what others wait for."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+BEFORE = """
+import atexit, os, sys, threading
+from colmap_tco.__main__ import run
+
+class Told:
+    def __del__(self, write=os.write):
+        write(1, b"taken apart")
+
+held = Told()
+atexit.register(print, "registered")
+"""
+
+
+def ended(*lines: str) -> subprocess.CompletedProcess[str]:
+    """A program that prepares the end and then checks a workspace that is not there."""
+    text = "\n".join([BEFORE, *lines, "sys.argv[1:] = ['check', 'no such folder']", "run()"])
+    return subprocess.run([sys.executable, "-c", text], cwd=ROOT, capture_output=True, text=True, check=False)
+
+
+def test_what_is_registered_for_the_end_is_done_and_nothing_is_taken_apart() -> None:
+    done = ended("print('printed', end='')")
+    assert done.returncode == 3
+    assert done.stdout == "printedregistered\n"
+    assert "no such folder" in done.stderr
+
+
+def test_a_thread_that_still_works_is_waited_for() -> None:
+    done = ended("threading.Thread(target=lambda: (threading.main_thread().join(), print('worked'))).start()")
+    assert done.returncode == 3
+    assert done.stdout.splitlines() == ["worked", "registered", "taken apart"], "in Python's own way"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+def test_what_cannot_be_written_is_an_error() -> None:
+    with Path("/dev/full").open("w") as full:
+        program = "\n".join([BEFORE, "print('printed')", "sys.argv[1:] = ['--version']", "run()"])
+        done = subprocess.run(
+            [sys.executable, "-c", program], cwd=ROOT, stdout=full, stderr=subprocess.DEVNULL, check=False
+        )
+    assert done.returncode != 0
