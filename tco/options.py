@@ -218,9 +218,9 @@ class TCOConfig:
     """Test-time constrained optimisation (Zhou et al., arXiv 2604.03878)."""
 
     steps: int = knob(
-        5,
-        "optimisation steps of each chunk on the network; 0 leaves it as it is (plain feed-forward). The "
-        "paper takes 40, at a lower rate",
+        2,
+        "optimisation steps of each chunk on the network; 0 leaves it as it is (plain feed-forward), and "
+        "depths are not refined then. The paper takes 40, at a lower rate",
     )
     rate: float = knob(7e-4, "learning rate of the adapters (Adam); lower it if the loss jumps")
     lora_rank: int = knob(4, "rank of the adapters; more adapts more and overfits sooner")
