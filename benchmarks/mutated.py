@@ -438,7 +438,8 @@ MUTATIONS = [
         ("down * field.diff(dim=0).abs()", "0 * field.diff(dim=0).abs()"),
         ('weights["warped"] = weights.pop("photometric")', 'weights.pop("photometric")'),
         ("self.prediction.depth[chosen] * factor", "self.prediction.depth[chosen] * factor.detach()"),
-        ("self.now.depth[seen] = self.refined(seen).depth", "self.now.depth[seen] *= 1"),
+        ("self.now.depth[self.drawn] = self", "self.now.depth[self.drawn[:0]] = self"),
+        ("            run.renew()\n", ""),
         ("view * len(self.levels) + i", "view + i * len(self.levels)"),
     ),
     *_of(

@@ -122,6 +122,7 @@ def polish(
         figures = {"loss": 0.0} | {name: float(value) for name, value in run.gradients().items()}
         if _finite(run.field, figures["loss"]):
             optimiser.step()
+            run.renew()
         else:
             logger.warning("step %d on the depths: the loss or its gradient is not finite; skipped", step)
             skipped.append(step)
@@ -146,17 +147,20 @@ class _Polishing:
         self.weights = _weights(terms, config)
         self.edges = picture_edges(terms.views.images)
         self.now = replace(prediction, depth=prediction.depth.clone(), stages=())
+        self.drawn: list[int] = []
 
     def gradients(self) -> dict[str, Tensor]:
         """Means of the terms over the sources of a step, whose gradients are added to the field's."""
-        pairs = [(s, self.targets(s)) for s in self.sources.draw(self.config.polish.polish_sources)]
-        seen = sorted({target for _, targets in pairs for target in targets})
-        if seen:
-            with torch.no_grad():
-                self.now.depth[seen] = self.refined(seen).depth
+        self.drawn = self.sources.draw(self.config.polish.polish_sources)
+        pairs = [(source, self.targets(source)) for source in self.drawn]
         if self.terms.extra:  # which need not allow that two are computed at once
             return means([self.of_source(*pair) for pair in pairs])
         return means(side_by_side(lambda pair: self.of_source(*pair), pairs, self.prediction.depth.device))
+
+    @torch.no_grad()
+    def renew(self) -> None:
+        """Compute anew what has changed: the depths of the step's sources, and no others'."""
+        self.now.depth[self.drawn] = self.refined(self.drawn).depth
 
     def targets(self, source: int) -> list[int]:
         """Views that a source is compared with."""

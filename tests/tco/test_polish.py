@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -166,19 +168,39 @@ def test_the_same_seed_gives_the_same_depths(scene: Wall) -> None:
 
 
 def test_hidden_pixels_are_found_by_depths_of_the_moment(scene: Wall) -> None:
-    """What the targets' depths are told to be follows their fields."""
+    """What the targets' depths are told to be follows their fields; a step moves those of its sources."""
     right = predicted(scene, torch.ones_like(scene.depth))
     run = _Polishing(
         right, right.cameras, Terms(scene.views, scene.priors, CONFIG), CONFIG,
         torch.Generator().manual_seed(0), (),
     )  # fmt: skip
+    run.gradients()
     with torch.no_grad():
         for grid in run.field.grids:
-            grid.add_(0.05)
-    run.gradients()
+            if grid.grad is not None:
+                grid.add_(0.05)
+    run.renew()
     told = (run.now.depth / scene.depth).flatten(1).median(1).values
-    levels = len(CONFIG.polish.polish_levels)
-    torch.testing.assert_close(told, torch.full_like(told, math.exp(0.05 * levels)))
+    expected = torch.ones_like(told)
+    expected[run.drawn] = math.exp(0.05 * len(CONFIG.polish.polish_levels))
+    assert len(run.drawn) == CONFIG.polish.polish_sources < len(told)
+    torch.testing.assert_close(told, expected)
+
+
+def test_every_step_knows_what_the_ones_before_moved(scene: Wall, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the others are told of a source is what its own field says of it."""
+    known: list[bool] = []
+    of_source = Terms.of_source
+
+    def watched(
+        self: Terms, source: int, targets: Sequence[int], mine: Prediction, now: Prediction, *rest: Any
+    ) -> dict[str, Tensor]:
+        known.append(torch.equal(now.depth[source], mine.depth[0].detach()))
+        return of_source(self, source, targets, mine, now, *rest)
+
+    monkeypatch.setattr(Terms, "of_source", watched)
+    moved = refined(scene, predicted(scene, bump(scene, 0.04))).depth
+    assert len(known) >= 2 * len(moved) and all(known)
 
 
 def test_what_a_target_hides_is_not_compared_until_its_depth_says_otherwise(scene: Wall) -> None:
@@ -207,6 +229,7 @@ def test_what_a_target_hides_is_not_compared_until_its_depth_says_otherwise(scen
     assert float((first[0][free] != 0).float().mean()) > 0.9
     with torch.no_grad():
         run.field.grids[1] += torch.where(left, math.log(2), 0.0)
+    run.renew()
     run.field.grids[0].grad = None
     run.gradients()
     second = run.field.grids[0].grad
