@@ -1,6 +1,6 @@
 """Densify the shared real sets and score them against their sensors, beside what else one could run.
 
-``python -m benchmarks.quality --steps 0 5 --baselines interp patchmatch`` prints a Markdown table;
+``python -m benchmarks.quality --steps 0 2 --baselines interp patchmatch`` prints a Markdown table;
 ``--output docs/quality.md`` writes it, and ``--part`` says which of that file it is.
 PatchMatch needs ``pip install --no-deps pyarchinit-photogrammetry-core``.
 ``--sets`` also takes the rendered scenes of ``benchmarks/rendered.py``, which are scored against their truth,
