@@ -82,7 +82,7 @@ TABLES = (
     Table("ablations-rendered", "ablations", "ablations.md", (*_THREE, "--steps", "12", *_RENDERED),
           "rendered scenes"),
     Table("ablations-default", "ablations", "ablations.md",
-          ("--size", "320", "--views", "0", "--steps", "5", "--only", "densify does,the same"), "full size"),
+          ("--size", "320", "--views", "0", "--steps", "2", "--only", "densify does,the same"), "full size"),
     Table("noise", "noise", "noise.md", (*_THREE, "--steps", "12")),
     Table("noise-rendered", "noise", "noise.md", (*_THREE, "--steps", "12", "--sets", "hills", "walk"),
           "rendered scenes"),

@@ -1,6 +1,6 @@
 """Is the predicted error of a pixel its actual error? Table and plot on the real sets.
 
-    python -m benchmarks.calibration [--steps 5] [--output docs/calibration.md]
+    python -m benchmarks.calibration [--steps 2] [--output docs/calibration.md]
 
 The embedded network predicts the scale b of a Laplace distribution of each pixel's relative depth error, for
 which the mean of |error| is b; confidence is 1 + 0.02 / b. The depths are those that densify writes:

@@ -52,10 +52,10 @@ ABLATIONS = (
 )  # fmt: skip
 ROWS = {
     False: ("base", "raw-depth", "pose", "intrinsics", "tco", "no-compatibility", *CURVE, *ABLATIONS),
-    True: ("steps=0", "tco", "adapt-only", "no-compatibility", *CURVE[1:], *NOISE),
+    True: ("steps=0", "tco", "adapt-only", "no-compatibility", *CURVE, *NOISE),
 }
 """Whether a network takes cameras as input → its rows, the network alone first. The other ablations of one
-that does are in ``benchmarks.ablations``, and five steps are its own number."""
+that does are in ``benchmarks.ablations``."""
 
 Figures = Mapping[str, float]
 

@@ -67,7 +67,7 @@ def line(steps: int, of_seeds: Sequence[Run]) -> str:
 def parser() -> argparse.ArgumentParser:
     """Command line."""
     parser = arguments(__doc__ or "")
-    parser.add_argument("--steps_list", type=int, nargs="+", default=[0, 5, 10, 20, 40, 80])
+    parser.add_argument("--steps_list", type=int, nargs="+", default=[0, 2, 5, 10, 20, 40, 80])
     parser.add_argument("--seeds", type=int, default=1, help="runs of each number of steps")
     return parser
 

@@ -16,7 +16,8 @@ def run() -> NoReturn:
 
     Of torch's and numba's modules and of their memory that takes Python a second. What is registered for the
     end (:mod:`atexit`) is done, and what was printed is written. Where another thread still works, or a
-    stream cannot be written, Python ends in its own way.
+    stream cannot be written, Python ends in its own way. What watches a program from around it, such as
+    ``python -m cProfile``, should call :func:`colmap_tco.cli.main` instead.
     """
     code = main()
     working = [t for t in threading.enumerate() if t is not threading.current_thread() and not t.daemon]
@@ -31,8 +32,9 @@ def run() -> NoReturn:
 def _flushed() -> bool:
     """Write what is buffered; whether that worked."""
     try:
-        sys.stdout.flush()
-        sys.stderr.flush()
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None:  # as in a process that was given none
+                stream.flush()
     except (OSError, ValueError):
         return False
     return True

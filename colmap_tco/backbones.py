@@ -300,9 +300,12 @@ def load(selected: Selected) -> Backbone:
 def suited(config: TCOConfig, network: Network, given: Sequence[str] = ()) -> TCOConfig:
     """The settings of optimisation, with the network's own where the user left the defaults.
 
-    Settings named in ``given`` stay in any case: the user asked for what happens to be the default.
+    Settings named in ``given`` stay in any case: the user asked for what happens to be the default. Who says
+    how many steps there shall be gets no more.
     """
     default = TCOConfig()
     untouched = {f.name for f in fields(TCOConfig) if getattr(config, f.name) == getattr(default, f.name)}
-    own = network.tco.items()
-    return replace(config, **{name: value for name, value in own if name in untouched.difference(given)})
+    free = untouched.difference(given)
+    if "steps" not in free:
+        free.discard("uncertain_steps")
+    return replace(config, **{name: value for name, value in network.tco.items() if name in free})

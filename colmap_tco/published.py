@@ -96,8 +96,8 @@ class Network:
         return tuple(module for module in self.modules if find_spec(module) is None)
 
 
-_PAPER = {"lora_targets": ("qkv", "proj", "fc1", "fc2"), "rate": 5e-4}
-"""Layers with adapters and learning rate of the published code (arXiv 2604.03878)."""
+_PAPER = {"lora_targets": ("qkv", "proj", "fc1", "fc2"), "rate": 5e-4, "steps": 40}
+"""Layers with adapters, learning rate and steps of the published code (arXiv 2604.03878)."""
 
 _DA3: dict[str, Any] = {
     "loader": "tco.backbones.da3:load",
@@ -128,6 +128,7 @@ NETWORKS: dict[str, Network] = {
             checkpoint=None,
             image_size=320,
             stride=16,
+            tco={"uncertain_steps": 12},
             most_views=128,
         ),
         Network(

@@ -21,7 +21,7 @@ from tco.hints import joined, told, with_more
 from tco.lora import LoRAConfig, adapted, changed, fits
 from tco.options import TCOConfig
 from tco.penalties import sparse_depth
-from tco.polish import polish, too_uncertain
+from tco.polish import polish, steps_on_network, too_uncertain
 from tco.schedule import Sources, Stagnation, draw_targets
 from tco.terms import COMPATIBILITY, ExtraTerm, Terms, errors_at, means
 from tco.types import Cameras, Prediction, Priors, SparseDepth, Views
@@ -85,7 +85,7 @@ def optimize(
         backbone: the network.
         views: V views on one canvas.
         priors: cameras with uncertainties, sparse points, overlap; or dense depth alone.
-        config: settings; ``steps = 0`` predicts without adapting.
+        config: settings; ``steps = 0`` predicts without adapting, and see ``uncertain_steps``.
         seed: of all randomness.
         report: called after every step with its number and its terms.
         watched: points of each view that nothing is fitted to. The history then holds ``held_out``: the mean
@@ -112,6 +112,7 @@ def optimize(
     True
     """
     config = config or TCOConfig()
+    config = replace(config, steps=steps_on_network(config, priors, views.size))
     with torch.no_grad():
         encoded, said, points = told(backbone, backbone.encode(views, priors), views, priors, config, seed)
         if config.steps == 0:

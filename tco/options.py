@@ -220,7 +220,13 @@ class TCOConfig:
     steps: int = knob(
         2,
         "optimisation steps of each chunk on the network; 0 leaves it as it is (plain feed-forward), and "
-        "depths are not refined then. The paper takes 40, at a lower rate",
+        "depths are not refined then. The paper takes 40 at a lower rate; other networks than sweep do, too",
+    )
+    uncertain_steps: int = knob(
+        0,
+        "so many at least, unless none are wanted, where cameras are too uncertain for depths to be refined "
+        "(polish_uncertainty): these steps are then all that seeks the cameras; sweep takes 12 unless steps "
+        "are given",
     )
     rate: float = knob(7e-4, "learning rate of the adapters (Adam); lower it if the loss jumps")
     lora_rank: int = knob(4, "rank of the adapters; more adapts more and overfits sooner")
@@ -306,7 +312,7 @@ class TCOConfig:
         check_range(self, "structure", 0, 1)
         check_range(self, "photometric_weight geometric_weight depth_weight sparse_weight", 0)
         check_range(self, "camera_weight rate camera_rate", 0)
-        check_range(self, "reencode stop_after occlusion_tolerance", 0)
+        check_range(self, "reencode stop_after occlusion_tolerance uncertain_steps", 0)
 
     def reference_schedule(self) -> TCOConfig:
         """The same objective on the published schedule, by a network that is asked once.

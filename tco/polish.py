@@ -238,6 +238,20 @@ def too_uncertain(priors: Priors, size: tuple[int, int], bound: float, consequen
     return moved > bound
 
 
+def steps_on_network(config: TCOConfig, priors: Priors, size: tuple[int, int]) -> int:
+    """How many steps the network is adapted by: as many as wanted, or more where cameras have to be sought.
+
+    Args:
+        config: ``steps`` and ``uncertain_steps``.
+        priors: of V views.
+        size: height and width of the views, pixels.
+    """
+    if config.steps == 0 or priors.cameras is None:
+        return config.steps
+    sought = displacement(priors, size) > config.polish.polish_uncertainty
+    return max(config.steps, config.uncertain_steps) if sought else config.steps
+
+
 def _weights(terms: Terms, config: TCOConfig) -> dict[str, float]:
     """The adaptation's weights, with colours warped, and with what polishing weighs in its own way."""
     c = config.polish

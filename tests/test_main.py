@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -25,8 +26,13 @@ atexit.register(print, "registered")
 
 def ended(*lines: str) -> subprocess.CompletedProcess[str]:
     """A program that prepares the end and then checks a workspace that is not there."""
-    text = "\n".join([BEFORE, *lines, "sys.argv[1:] = ['check', 'no such folder']", "run()"])
-    return subprocess.run([sys.executable, "-c", text], cwd=ROOT, capture_output=True, text=True, check=False)
+    command = [sys.executable, "-c", program(*lines)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=120)
+
+
+def program(*lines: str) -> str:
+    """Its text."""
+    return "\n".join([BEFORE, *lines, "sys.argv[1:] = ['check', 'no such folder']", "run()"])
 
 
 def test_what_is_registered_for_the_end_is_done_and_nothing_is_taken_apart() -> None:
@@ -45,8 +51,15 @@ def test_a_thread_that_still_works_is_waited_for() -> None:
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
 def test_what_cannot_be_written_is_an_error() -> None:
     with Path("/dev/full").open("w") as full:
-        program = "\n".join([BEFORE, "print('printed')", "sys.argv[1:] = ['--version']", "run()"])
+        command = [sys.executable, "-c", program("print('printed')")]
+        buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
         done = subprocess.run(
-            [sys.executable, "-c", program], cwd=ROOT, stdout=full, stderr=subprocess.DEVNULL, check=False
+            command, cwd=ROOT, env=buffered, stdout=full, stderr=subprocess.DEVNULL, check=False, timeout=120
         )
-    assert done.returncode != 0
+    assert done.returncode == 120, "as Python has it"
+
+
+def test_without_an_output_it_ends_as_with_one() -> None:
+    done = ended("sys.stdout = None")
+    assert done.returncode == 3
+    assert "Traceback" not in done.stderr

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,12 +59,14 @@ def content(paths: DensePaths, report: Mapping[str, Any], limits: Limits = Limit
     settings = report["settings"]
     held = (float(settings["priors"]["holdout"]), int(settings["seed"]))
     most = max(50, limits.observations // max(len(views), 1))
-    shown = {
-        view.name: camera_of(view) | {"errors": errors_at_points(paths, tracks, view, held, most)}
-        for view in views
-    }
-    for name, maps in all_maps(paths, views, limits).items():
-        shown[name]["maps"] = maps
+    with ThreadPoolExecutor(1) as beside:  # the cloud is half of the work
+        cloud = beside.submit(dense_cloud, paths, model, views, limits.cloud)
+        shown = {
+            view.name: camera_of(view) | {"errors": errors_at_points(paths, tracks, view, held, most)}
+            for view in views
+        }
+        for name, maps in all_maps(paths, views, limits).items():
+            shown[name]["maps"] = maps
     rows = [{"name": name, **row, **shown.get(name, {})} for name, row in report["views"].items()]
     rest = {key: value for key, value in report.items() if key not in ("views", "loss")}
     return {
@@ -72,7 +75,7 @@ def content(paths: DensePaths, report: Mapping[str, Any], limits: Limits = Limit
         "report": rest,
         "loss": [columns(steps) for steps in report["loss"]],
         "views": rows,
-        "cloud": dense_cloud(paths, model, views, limits.cloud),
+        "cloud": cloud.result(),
         "sparse": sparse_cloud(model, held, limits.cloud),
     }
 

@@ -1,6 +1,6 @@
 """Compiled loops of :mod:`tco.planar.label` and :mod:`tco.planar.fit`: how pixels stand to planes.
 
-Float32 throughout, a plane at a time, so that many pixels share an instruction.
+In float32, but for sums by colour, and a plane at a time, so that many pixels share an instruction.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ Floats = NDArray[np.float32]
 Labels = NDArray[np.int64]
 f32 = np.float32
 ZERO, HALF, ONE, LEAST = f32(0), f32(0.5), f32(1), f32(1e-6)
+FARTHEST = f32(1e15)
+"""Depth of a plane up to which its square is a number."""
 
 
 @njit(nogil=True, cache=True, fastmath={"nsz", "reassoc", "contract"}, error_model="numpy")
@@ -42,7 +44,7 @@ def on_own_depth(
             x, y, z = view[0, i], view[1, i], view[2, i]
             along = x * p[0] + y * p[1] + z * p[2]
             depth = p[3] / along
-            there = (depth > ZERO) & (depth < f32(1e30)) & (view[3, i] > ZERO)
+            there = (depth > ZERO) & (depth < FARTHEST) & (view[3, i] > ZERO)
             depth = depth if there else ONE
             log_depth = log(depth)
             off = log_depth - view[4, i]

@@ -160,7 +160,7 @@ def cost_of_keeping(view: Shown, frame: Frame, config: ConsensusConfig) -> Float
 def colour_bins(view: Shown) -> Labels:
     """Bin (H, W) of each pixel's colour, of the picture without its noise."""
     smooth = cv2.GaussianBlur(np.ascontiguousarray(view.image, np.float32), (0, 0), 1.0)
-    r, g, b = (np.clip(smooth * BINS, 0, BINS - 1).astype(np.int64)).transpose(2, 0, 1)
+    r, g, b = np.nan_to_num(smooth * BINS).clip(0, BINS - 1).astype(np.int64).transpose(2, 0, 1)
     return np.asarray((r * BINS + g) * BINS + b)
 
 

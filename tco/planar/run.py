@@ -147,7 +147,7 @@ def _view_on_planes(
         rows, columns = (np.minimum(np.arange(n) // stride, n // stride - 1) for n in view.depth.shape)
         label = label[rows[:, None], columns]
     label = np.where(view.known, label, 0).ravel()
-    depth = agreement.prediction.depth[i].clone()
+    depth = agreement.prediction.depth[i].clone(memory_format=torch.contiguous_format)
     error = torch.full_like(depth, torch.inf)
     for k, plane in enumerate(planes):
         on = np.flatnonzero(label == k + 1)

@@ -46,7 +46,7 @@ class Shown:
     centre: Floats
 
     def at(self, pixels: Labels) -> Shown:
-        """Some of its pixels, by their flat indices (N,): all of (H, W) is then of (N,)."""
+        """Some pixels, by flat indices (N,): what is of (H, W) is then of (N,); ``side`` means nothing."""
         depth, sure = (part.ravel()[pixels] for part in (self.depth, self.sure))
         image, directions = (part.reshape(-1, 3)[pixels] for part in (self.image, self.directions))
         return Shown(depth, sure, self.known.ravel()[pixels], image, directions, self.centre)

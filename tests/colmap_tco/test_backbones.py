@@ -251,8 +251,13 @@ def test_a_default_that_the_command_line_names_stands() -> None:
 
 def test_the_networks_own_settings_hold_where_the_user_gave_none() -> None:
     vggt = NETWORKS["vggt"]
-    assert suited(TCOConfig(), NETWORKS["sweep"]) == TCOConfig()
-    assert suited(TCOConfig(), vggt).rate == 5e-4
+    assert suited(TCOConfig(), NETWORKS["sweep"]) == TCOConfig(uncertain_steps=12)
+    for few in (
+        suited(TCOConfig(steps=5), NETWORKS["sweep"]),
+        suited(TCOConfig(), NETWORKS["sweep"], ("steps",)),
+    ):
+        assert few.uncertain_steps == 0
+    assert (suited(TCOConfig(), vggt).rate, suited(TCOConfig(), vggt).steps) == (5e-4, 40)
     mine = suited(TCOConfig(rate=3e-3, steps=7), vggt)
     assert mine.rate == 3e-3 and mine.steps == 7
     assert mine.lora_targets == ("qkv", "proj", "fc1", "fc2")
