@@ -181,7 +181,7 @@ MUTATIONS = [
         ("counts = (views.valid & known & smooth(depth))", "counts = (views.valid & known)"),
         ("counts = (views.valid & known & smooth(depth))", "counts = (known & smooth(depth))"),
         ("asked.where(known[view], moved[view])", "asked"),
-        ("for view in views.wanted:", "for view in range(len(views)):"),
+        ("side_by_side(move, views.wanted,", "side_by_side(move, list(range(len(views))),"),
         ("torch.log(own / depth)[None]", "torch.zeros_like(own)[None]"),
         ("range(config.consensus_rounds)", "range(1)"),
         ("(there[:, 2] > ALL)", "(there[:, 2] > 0.5)"),
