@@ -295,8 +295,7 @@ MUTATIONS = [
         ("if own[j] < most:", "if own[j] <= cheapest:"),
         ("np.uint64(j)], own[j] + weight * kappa", "np.uint64(j)], own[j]"),
         ("unary, logs / tau", "unary, logs"),
-        ("for k in range(1, labels):", "for k in range(2, labels):"),
-        ("for j in range(1, labels):", "for j in range(2, labels):"),
+        ("cheapest + weight * (ONE + kappa)", "cheapest + weight * kappa"),
         ("share = ONE / f32(max((x > 0) + (y > 0), (x + 1 < w) + (y + 1 < h), 1))", "share = ONE"),
         ("total += down[y - 1, x] *", "total += 0 *"),
     ),
@@ -440,6 +439,8 @@ MUTATIONS = [
         ("self.prediction.depth[chosen] * factor", "self.prediction.depth[chosen] * factor.detach()"),
         ("self.now.depth[self.drawn] = self", "self.now.depth[self.drawn[:0]] = self"),
         ("            run.renew()\n", ""),
+        ("max(config.steps, config.uncertain_steps) if", "config.steps if"),
+        ("if config.steps == 0 or priors.cameras", "if priors.cameras"),
         ("view * len(self.levels) + i", "view + i * len(self.levels)"),
     ),
     *_of(
