@@ -111,4 +111,4 @@ def test_rows_suit_the_network(real: RealSet) -> None:
     with pytest.raises(InputError, match="takes poses and intrinsics as input"):
         check_row(sweep, parse_rows(["pose"], BOTH)[0])
     ours = settings(Selected(NETWORKS["sweep"], EMBEDDED, torch.device("cpu"), ""))
-    assert ours == TCOConfig()
+    assert ours == TCOConfig(uncertain_steps=12)
