@@ -162,7 +162,7 @@ def main() -> None:
         network = load_network(chosen)
         config = settings(chosen)
         if args.steps:
-            config = replace(config, steps=args.steps)
+            config = replace(config, steps=args.steps, uncertain_steps=0)
         rows = parse_rows(args.rows or ROWS[network.uses_cameras], BOTH)
         for row in rows:
             check_row(network, row)

@@ -373,7 +373,7 @@ MUTATIONS = [
         ("max(2, shared, bound)", "max(2, shared)"),
         ("torch.maximum(agreement.error, of_plane)", "of_plane"),
         ("frame is not None and faces_along(plane, frame) for", "True for"),
-        ("label[on[there == 0]] = 0", "pass"),
+        ("label[on[~met]] = 0", "pass"),
         ("if agreement.prediction is prediction:", "if False:"),
     ),
     *_of(

@@ -103,9 +103,10 @@ def _parse(name: str, priors: tuple[str, ...]) -> Row:
     if kind in fixed and not value:
         return fixed[kind]
     numbers = _numbers(name, value, 3 if kind == "noise" else 1)
-    if kind in ("rank", "steps") and numbers[0] == int(numbers[0]) >= (kind == "rank"):
-        key = "lora_rank" if kind == "rank" else "steps"
-        return replace(plain, changes=((key, int(numbers[0])),))
+    if kind == "rank" and numbers[0] == int(numbers[0]) >= 1:
+        return replace(plain, changes=(("lora_rank", int(numbers[0])),))
+    if kind == "steps" and numbers[0] == int(numbers[0]):  # so many, whatever the cameras
+        return replace(plain, changes=(("steps", int(numbers[0])), ("uncertain_steps", 0)))
     if kind == "radius" and numbers[0] > 0:
         return replace(plain, ablation=(("radius_factor", numbers[0]),))
     if kind == "noise":

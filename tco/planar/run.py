@@ -151,9 +151,10 @@ def _view_on_planes(
     error = torch.full_like(depth, torch.inf)
     for k, plane in enumerate(planes):
         on = np.flatnonzero(label == k + 1)
-        there = plane.depth(view.at(on))
-        label[on[there == 0]] = 0
-        on, there = on[there > 0], there[there > 0]
-        depth.view(-1)[on] = torch.from_numpy(there).to(depth)
-        error.view(-1)[on] = torch.from_numpy(plane.error(view.at(on), there)).to(error)
+        part = view.at(on)
+        there = plane.depth(part)
+        met = there > 0
+        label[on[~met]] = 0
+        depth.view(-1)[on[met]] = torch.from_numpy(there[met]).to(depth)
+        error.view(-1)[on[met]] = torch.from_numpy(plane.error(part, there)[met]).to(error)
     return depth, error, torch.from_numpy(label).reshape(depth.shape)

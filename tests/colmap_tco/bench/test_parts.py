@@ -182,6 +182,8 @@ def test_rows_change_what_they_say_and_nothing_else() -> None:
     assert changed("rank=16") == {"lora_rank": 16}
     assert changed("radius=0.05") == {"radius_factor": 0.05}
     assert changed("steps=80") == {"steps": 80}
+    more = rows["steps=80"].config(replace(plain, uncertain_steps=99))
+    assert (more.steps, more.uncertain_steps) == (80, 0)
     assert changed("surfels") == {"lora_targets": (), "free_depth": True, "free_surfels": True}
     assert set(changed("no-compatibility")) == {"photometric_weight", "polish"}
     assert rows["noise=1/0.01/0"].noise == Noise(1, 0.01, 0)
