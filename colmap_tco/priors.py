@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from colmap_tco._pycolmap import Floats, Ints, Mask, focal_lengths
 from colmap_tco.errors import InputError
-from colmap_tco.tracks import Tracks, covisibility
+from colmap_tco.tracks import OVERLAPS, Tracks, covisibility
 from colmap_tco.views import (
     ChunkFrame,
     View,
@@ -62,6 +62,12 @@ class PriorConfig:
         "the median depth of the view's points",
     )
     focal_sigma: float = knob(0.005, "relative standard deviation of the focal lengths")
+    overlap_by: str = knob(
+        "both",
+        "which views are matched with each other. number: those that share the most points; angle: the most "
+        "by MVSNet's weight of the triangulation angle; both: by the geometric mean of the two",
+        choices=OVERLAPS,
+    )
     pose_covariance: bool = knob(
         False,
         "add, in squares, what the covariance of COLMAP's bundle adjustment says of each camera, for models "
@@ -197,11 +203,11 @@ def build_priors(
     held = [held_out(points.track, config.holdout, seed) for points in seen]
     depth = np.array([np.median(points.depth) if len(points.depth) else 1.0 for points in seen])
     rotation, centre = _pose_sigmas(tracks, views, depth, frame.scale, config)
-    common = covisibility(tracks, [view.image_id for view in views]).common
+    overlap = covisibility(tracks, [view.image_id for view in views]).overlap(config.overlap_by)
     priors = Priors(
         cameras=canvas_cameras(views, frame),
         sparse=tuple(points.tensors(~mask) for points, mask in zip(seen, held, strict=True)),
-        overlap=torch.from_numpy(common).float(),
+        overlap=torch.from_numpy(overlap).float(),
         rotation_sigma=torch.from_numpy(rotation).float(),
         centre_sigma=torch.from_numpy(centre).float(),
         focal_sigma=torch.full((len(views),), config.focal_sigma),

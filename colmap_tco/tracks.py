@@ -64,6 +64,10 @@ class Tracks:
     deviations: Mapping[int, tuple[float, float]] = field(default_factory=dict)
 
 
+OVERLAPS = ("both", "number", "angle")
+"""Ways to say how well two views overlap; see :meth:`Covisibility.overlap`."""
+
+
 @dataclass(frozen=True)
 class Covisibility:
     """How much pairs of views share; symmetric, zero on the diagonal.
@@ -75,6 +79,21 @@ class Covisibility:
 
     common: Ints
     score: Floats
+
+    def overlap(self, by: str = "both") -> Floats:
+        """How well two views tell each other's depths (V, V).
+
+        By ``both``, the geometric mean of the two, it is much that they share, seen from directions that tell
+        its depth. The ``number`` alone favours neighbours in a film, that hardly differ; the score by
+        ``angle`` alone leaves next to nothing of pairs that are nearer than 5°.
+
+        Raises:
+            ValueError: there is no such way, see :data:`OVERLAPS`.
+        """
+        if by not in OVERLAPS:
+            raise ValueError(f"views overlap by one of {', '.join(OVERLAPS)}, not by {by!r}")
+        ways = dict(zip(OVERLAPS, (np.sqrt(self.common * self.score), self.common, self.score), strict=True))
+        return ways[by].astype(float)
 
 
 def read_tracks(model: Model, level: int = logging.DEBUG) -> Tracks:
@@ -187,19 +206,28 @@ def inverse(information: Floats) -> Floats:
 
 
 def covisibility(tracks: Tracks, image_ids: Sequence[int]) -> Covisibility:
-    """Common points of every pair of images, plainly counted and weighted.
+    """Common points of every pair of images of a model; see :func:`counted`."""
+    points = [tracks.images[i].point for i in image_ids]
+    return counted(points, np.stack([tracks.centres[i] for i in image_ids]), tracks.xyz)
+
+
+def counted(points: Sequence[Ints], centres: Floats, xyz: Floats) -> Covisibility:
+    """Common points of every pair of V views, plainly counted and weighted.
 
     The weight of a point with triangulation angle θ is exp(−(θ − 5°)² / 2σ²), σ = 1° below 5° and 10°
     above (MVSNet, Yao et al. 2018, section 4.1): narrower pairs give no depth, wider ones look
     different.
+
+    Args:
+        points: indices of those that each view observes.
+        centres: (V, 3) of the cameras.
+        xyz: (P, 3) of the points.
     """
-    size = len(image_ids)
-    views = np.concatenate([np.full(len(tracks.images[i].point), v) for v, i in enumerate(image_ids)])
-    point = np.concatenate([tracks.images[i].point for i in image_ids])
+    size = len(points)
+    views = np.concatenate([np.full(len(seen), v) for v, seen in enumerate(points)])
     common, score = np.zeros(size * size, np.int64), np.zeros(size * size)
-    centres = np.stack([tracks.centres[i] for i in image_ids])
-    for p, a, b in _pairs(point, views):
-        to_a, to_b = centres[a] - tracks.xyz[p], centres[b] - tracks.xyz[p]
+    for p, a, b in _pairs(np.concatenate(points), views):
+        to_a, to_b = centres[a] - xyz[p], centres[b] - xyz[p]
         cosine = (to_a * to_b).sum(1) / (np.linalg.norm(to_a, axis=1) * np.linalg.norm(to_b, axis=1))
         angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
         weight = np.exp(-0.5 * ((angle - BEST_ANGLE) / np.where(angle <= BEST_ANGLE, NARROW, WIDE)) ** 2)

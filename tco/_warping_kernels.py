@@ -1,6 +1,6 @@
 """Compiled loops of :mod:`tco.warped`: a source's pixels looked up in a target, compared, and derived.
 
-Arrays are float32 and contiguous; pictures are (3, H, W). Divisions by zero are not looked for, without which
+Arrays are float32 and contiguous; pictures are (C, H, W). Divisions by zero are not looked for, without which
 the compiler makes no vector instructions of a loop. Helpers are inlined: a function that is called could be
 linked in another form when it is read from disk than when it was compiled, and round otherwise.
 """
@@ -24,7 +24,7 @@ class Target(NamedTuple):
     """What a source is looked up in.
 
     Attributes:
-        image: (3, H, W), flat. inverse: (H, W) its inverse depth, flat. valid: (H, W) 1 or 0, flat.
+        image: (C, H, W), flat. inverse: (H, W) its inverse depth, flat. valid: (H, W) 1 or 0, flat.
         pose: (3, 4) that takes the source's pixel (x, y, 1) times its depth, and 1, to a homogeneous pixel.
     """
 
@@ -38,7 +38,7 @@ class Found(NamedTuple):
     """What is found there, all (·, H, W), written by :func:`look_up`.
 
     Attributes:
-        color: (3, H, W). slope: (3, H, W) its derivative by the source's depth.
+        color: (C, H, W). slope: (C, H, W) its derivative by the source's depth.
         weight: (H, W), 0 where a pixel does not count.
     """
 
@@ -78,6 +78,7 @@ def look_up(depth: Floats, opacity: Floats, tolerance: float, target: Target, fo
     """
     h, w = depth.shape
     inside, most, at = 0, f32(1 + tolerance), np.empty((5, w), np.float32)
+    channels = Index(len(found.color))
     right, bottom = f32(w) - HALF, f32(h) - HALF
     for y in range(h):
         _project(depth[y], target.pose, y, at)
@@ -85,7 +86,7 @@ def look_up(depth: Floats, opacity: Floats, tolerance: float, target: Target, fo
             u, v, z = at[0, x], at[1, x], at[2, x]
             if not (z > f32(1e-3) and u >= HALF and v >= HALF and u <= right and v <= bottom):
                 found.weight[y, x] = 0
-                for k in range(3):
+                for k in range(channels):
                     found.color[k, y, x] = found.slope[k, y, x] = 0
                 continue
             inside += 1
@@ -94,7 +95,7 @@ def look_up(depth: Floats, opacity: Floats, tolerance: float, target: Target, fo
             gx, gy = ONE - fx, ONE - fy
             one, below = Index(j * w + i), Index(min(j + 1, h - 1) * w + i)
             step = Index(i + 1 < w)
-            for k in range(Index(3)):
+            for k in range(channels):
                 first = k * Index(h * w)
                 p, q = target.image[first + one], target.image[first + one + step]
                 r, s = target.image[first + below], target.image[first + below + step]
@@ -319,8 +320,8 @@ def compare(
 
     Args:
         found: after :func:`exposure`.
-        image: (3, H, W) of the source.
-        of_image: (3, 2, H, W) means under the window of each channel and of its square.
+        image: (C, H, W) of the source.
+        of_image: (C, 2, H, W) means under the window of each channel and of its square.
         kernel: (``TAPS``,) of the window; empty: no structural term.
         terms: share of the structural term, and C₁ and C₂ of SSIM.
         work: (7, H, W) to write in.

@@ -87,7 +87,7 @@ def agreed(
             not positive and finite is none, says nothing and stays.
         cameras: of all V views.
         views: whose valid pixels count, and which of them are wanted.
-        priors: whose ``overlap`` says which views share most points, and so are asked, and whose standard
+        priors: whose ``overlap`` says which views overlap best, and so are asked, and whose standard
             deviations of the cameras say whether asking is of any use.
         config: settings.
 

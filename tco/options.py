@@ -38,8 +38,8 @@ class AblationConfig:
     )
     source_order: str = knob(
         "epoch",
-        "how source views are drawn. epoch: each once before any comes again; overlap: by the number of "
-        "points they share with the others; uniform: with repetition, as published",
+        "how source views are drawn. epoch: each once before any comes again; overlap: by how well they "
+        "overlap with the others; uniform: with repetition, as published",
         choices=("epoch", "overlap", "uniform"),
     )
     published_objective: bool = knob(
@@ -88,6 +88,9 @@ class PolishConfig:
         "share of the longer side: depths would make up for the cameras' errors",
     )
     polish_sources: int = knob(2, "views whose depths each step of these refines")
+    polish_colours: bool = knob(
+        False, "refine by all colours; else by their mean alone, which says as much in two thirds of the time"
+    )
     polish_smoothness: float = knob(
         0.1,
         "weight of the mean difference between the logarithms of the factors of neighbouring pixels, less "
@@ -125,7 +128,7 @@ class ConsensusConfig:
         "times that each pixel's depth is moved to the weighted median of what the views say of it, each "
         "with its own depths; 0: the depths of a view are its own alone, not on planes either",
     )
-    consensus_views: int = knob(20, "views that a pixel asks, those that share the most points")
+    consensus_views: int = knob(20, "views that a pixel asks, those that overlap best")
     consensus_reach: float = knob(
         0.15,
         "largest logarithm of the ratio of two depths that are taken for the same surface; lower it where "

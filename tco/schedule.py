@@ -12,8 +12,8 @@ from torch import Tensor
 class Sources:
     """Draws the views that steps render from.
 
-    ``epoch``: a random order, each view once before any comes again. ``overlap``: with odds of the number
-    of points that a view shares with all others. ``uniform``: with equal odds. Within one step no view is
+    ``epoch``: a random order, each view once before any comes again. ``overlap``: with odds of the sum
+    of what a view has in common with all others. ``uniform``: with equal odds. Within one step no view is
     drawn twice.
     """
 
@@ -61,7 +61,7 @@ def draw_targets(overlap: Tensor, source: int, count: int, generator: torch.Gene
 
 
 def most_overlapping(overlap: Tensor, view: int, count: int) -> list[int]:
-    """At most ``count`` other views, those that share most with ``view`` first; none that shares nothing."""
+    """At most ``count`` other views, the best overlapping with ``view`` first; none that shares nothing."""
     shared = overlap[view].detach().cpu().tolist()
     others = [other for other in range(len(shared)) if other != view and shared[other] > 0]
     return sorted(others, key=lambda other: -shared[other])[:count]

@@ -59,6 +59,7 @@ class Terms:
     """Terms of the views of one chunk, with what is known of them.
 
     Attributes:
+        looked_up: the views with the pictures that pixels are looked up in (weight ``warped``).
         sparse: triangulated points, one :class:`SparseDepth` a view, empty where there are none.
         overlap: (V, V) how much views share; all alike where it is not known.
     """
@@ -84,6 +85,7 @@ class Terms:
             self._check_depth()
         if self.given is not None and config.sparse_weight > 0 and priors.sparse is None:
             raise ValueError("sparse_weight is set and there are no sparse points among the priors")
+        self.looked_up = views if config.polish.polish_colours else grey(views)
         self.sparse = priors.sparse or (_no_points(views.images),) * len(views)
         alike = torch.ones(len(views), len(views)).fill_diagonal_(0)
         self.overlap = alike if priors.overlap is None else priors.overlap
@@ -196,7 +198,7 @@ class Terms:
         if "warped" in weights:
             opacity = self._opacity(source, prediction).detach()
             terms["warped"] = warped_difference(
-                depth, opacity, self.views, cameras, (source, targets), context, self.objective
+                depth, opacity, self.looked_up, cameras, (source, targets), context, self.objective
             )
         return terms
 
@@ -240,6 +242,11 @@ def comparison(config: TCOConfig) -> tuple[ObjectiveConfig, SurfelConfig]:
         renderer=a.renderer,
     )
     return objective, SurfelConfig(a.radius_factor, confident_opacity=a.confident_opacity)
+
+
+def grey(views: Views) -> Views:
+    """The views with the mean of their colours, images (V, 1, H, W)."""
+    return replace(views, images=views.images.mean(1, keepdim=True))
 
 
 def errors_at(depth: Tensor, points: SparseDepth) -> Tensor:

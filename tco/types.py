@@ -54,7 +54,7 @@ class Views(_Movable):
     """What a backbone sees: V images on one canvas.
 
     Attributes:
-        images: (V, 3, H, W) RGB in [0, 1].
+        images: (V, 3, H, W) RGB in [0, 1]; where a function says so, (V, C, H, W) of any kind.
         valid: (V, H, W) bool; False where the canvas is padding or masked out.
         names: V image names, used in messages alone.
         helpers: how many of the last views only help the others: their own depths are not asked for.
@@ -164,7 +164,8 @@ class Priors(_Movable):
         cameras: poses and intrinsics.
         sparse: one :class:`SparseDepth` a view.
         depth: (V, H, W) dense depth, 0 where there is none.
-        overlap: (V, V) how much two views share (number of common tracks); the diagonal is 0.
+        overlap: (V, V) how well two views tell each other's depths, by what they share and how far apart they
+            are; 0 where they share nothing, and on the diagonal.
         rotation_sigma: (V,) standard deviation of the pose prior's rotation about each axis, radians.
         centre_sigma: (V,) standard deviation of the camera centre along each axis, in units of length.
         focal_sigma: (V,) standard deviation of the relative focal length.

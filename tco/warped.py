@@ -34,7 +34,7 @@ def warped_difference(
     Args:
         depth: (H, W) of the source, differentiable.
         opacity: (H, W) in [0, 1], 0 where the source is not valid.
-        views: images and valid pixels of all V views.
+        views: images, of any number of channels, and valid pixels of all V views.
         cameras: of all V views, differentiable.
         pair: the source and its T targets.
         context: prediction for all V views, held constant.

@@ -27,7 +27,7 @@ class Warped:
     Attributes:
         depth: (T, H, W) camera z of the source's pixels in the targets, differentiable.
         ratio: (T, H, W) that z over the target's own depth; 1 where the two agree.
-        color: (T, H, W, 3) RGB of the targets.
+        color: (T, H, W, C) of the targets.
         valid: (T, H, W) bool, in front of the target, on its image, and on valid pixels of it alone.
     """
 
@@ -44,7 +44,7 @@ def warp(
 
     Args:
         depth: (H, W) of the source, differentiable.
-        views: images and valid pixels of all V views.
+        views: images, of any number of channels, and valid pixels of all V views.
         cameras: of all V views, differentiable.
         source: index of the source.
         targets: indices of T targets.
@@ -64,7 +64,7 @@ def warp(
     inverse = 1 / context.depth[chosen].clamp_min(1e-6)
     constant = torch.stack([inverse, views.valid[chosen].to(depth)], 1)
     maps = torch.cat([constant.detach(), views.images[chosen]], 1)
-    found = sample(maps, xy).reshape(len(chosen), 5, h, w)
+    found = sample(maps, xy).reshape(*maps.shape[:2], h, w)
     z = z.reshape(-1, h, w)
     return Warped(
         depth=z,
@@ -84,7 +84,7 @@ def warped_photometric(
 
     Args:
         warped: the source in T targets.
-        image: (3, H, W) RGB of the source.
+        image: (C, H, W) of the source.
         opacity: (H, W) in [0, 1], 0 where the source is not valid.
         config: options; those of alpha and of the renderer have nothing to act on.
 

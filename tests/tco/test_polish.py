@@ -92,15 +92,32 @@ def test_a_level_is_linear_between_the_middles_of_its_cells() -> None:
     torch.testing.assert_close(field([0])[0, :, 2:-2], x[2:-2].expand(16, 20))
 
 
-def test_colours_are_warped_and_find_the_wall(scene: Wall) -> None:
-    """Alone they take most of a bump away."""
+@pytest.mark.parametrize(("colours", "left"), [(True, 0.6), (False, 0.7)])
+def test_colours_are_warped_and_find_the_wall(scene: Wall, colours: bool, left: float) -> None:
+    """Alone they take much of a bump away; their mean less, as this wall's colours have nothing in common."""
     wrong = predicted(scene, bump(scene, 0.02))
     assert scene.priors.cameras is not None
-    config = replace(CONFIG, sparse_weight=0.0)
+    polished = replace(CONFIG.polish, polish_colours=colours)
+    config = replace(CONFIG, sparse_weight=0.0, polish=polished)
     terms = Terms(scene.views, scene.priors, config)
     done = polish(wrong, scene.priors.cameras, terms, config, torch.Generator().manual_seed(0))
     assert all(step.keys() == {"warped", "loss"} for step in done.history)
-    assert off(done.prediction, scene) < 0.6 * off(wrong, scene)
+    assert off(done.prediction, scene) < left * off(wrong, scene)
+
+
+def test_the_mean_of_the_colours_is_all_that_is_looked_at_unless_all_are_wanted(scene: Wall) -> None:
+    """What is added to one colour and taken from another is not seen."""
+    hue = torch.zeros_like(scene.views.images)
+    hue[:, 0] = 0.1 * torch.rand(hue[:, 0].shape, generator=torch.Generator().manual_seed(0))
+    hue[:, 2] = -hue[:, 0]
+    tinted = replace(scene, views=replace(scene.views, images=scene.views.images + hue))
+    wrong = predicted(scene, bump(scene, 0.02))
+    moved = []
+    for colours in (False, True):
+        config = replace(CONFIG, polish=replace(CONFIG.polish, polish_colours=colours))
+        plain, other = (refined(s, wrong, config).depth for s in (scene, tinted))
+        moved.append(float((plain / other - 1).abs().mean()))
+    assert moved[0] < 1e-4 and moved[1] > 1e-3
 
 
 def test_roughness_is_the_mean_step_and_edges_of_the_picture_are_free() -> None:

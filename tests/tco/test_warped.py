@@ -59,9 +59,13 @@ def by_tensors(depth: Tensor, parts: Scene, targets: list[int], config: Objectiv
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda c: f"{c.exposure}-{c.structure}")
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_value_and_derivative_are_those_of_the_tensor_operations(seed: int, config: ObjectiveConfig) -> None:
-    parts = scene(seed)
-    depth, opacity, views, cameras, context = parts
+@pytest.mark.parametrize("channels", [1, 3])
+def test_value_and_derivative_are_those_of_the_tensor_operations(
+    channels: int, seed: int, config: ObjectiveConfig
+) -> None:
+    depth, opacity, views, cameras, context = scene(seed)
+    views = replace(views, images=views.images[:, :channels])
+    parts = depth, opacity, views, cameras, context
     for targets in ([1], [3, 1, 2]):
         exact = depth.double().requires_grad_()
         expected = by_tensors(exact, parts, targets, config)
