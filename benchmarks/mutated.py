@@ -494,6 +494,30 @@ MUTATIONS = [
         ("pixel_centre=0.0, confident", "pixel_centre=0.5, confident"),
         ("penalties.depth(every, self.depth, mask, chosen)", "penalties.depth(every, self.depth, mask)"),
     ),
+    *_of(
+        "tco/terms.py",
+        "polish",
+        ("views if config.polish.polish_colours else grey(views)", "views"),
+        ("images=views.images.mean(1, keepdim=True)", "images=views.images[:, :1]"),
+    ),
+    *(
+        Mutation("colmap_tco/tracks.py", old, new, ("tests/colmap_tco/test_tracks.py",))
+        for old, new in (
+            ("np.sqrt(self.common * self.score), self.common", "self.common, self.common"),
+            ("NARROW, WIDE)) ** 2", "WIDE, NARROW)) ** 2"),
+            ("centres[a] - xyz[p], centres[b] - xyz[p]", "centres[a] - xyz[p], centres[a] - xyz[p]"),
+        )
+    ),
+    *(
+        Mutation(file, old, new, (tests,))
+        for file, old, new, tests in (
+            ("colmap_tco/priors.py", "overlap(config.overlap_by)", "overlap()",
+             "tests/colmap_tco/test_priors.py"),
+            ("colmap_tco/_pycolmap.py", "with sigterm_kept():", "if True:", "tests/test_cli.py"),
+            ("training/dataset.py", "pairs.overlap()", 'pairs.overlap("number")',
+             "tests/training/test_dataset.py"),
+        )
+    ),
     *_of("tco/options.py", "toy", ("        3e-4,\n", "        1.0,\n")),
     *_of("tco/options.py", "prefix", ('source_order="uniform", run_ahead=False', 'source_order="uniform"')),
     *_of("tco/optimize.py", "prefix", ("if self.config.ablation.run_ahead and", "if")),

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from colmap_tco import model_files
 from colmap_tco.errors import InputError
+from colmap_tco.signals import sigterm_kept
 
 Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
@@ -49,9 +50,8 @@ def load() -> Any:
     from PIL import Image
 
     Image.init()  # loads the plug-ins, PNG among them
-
-    import pycolmap
-
+    with sigterm_kept():
+        import pycolmap
     talkative = logging.getLogger("pycolmap").isEnabledFor(logging.INFO)
     pycolmap.logging.minloglevel = 0 if talkative else 2  # glog's INFO and ERROR
     return pycolmap

@@ -10,6 +10,7 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
+from colmap_tco import _pycolmap
 from colmap_tco.errors import InputError, MissingError, OutOfMemoryError, PartlyDoneError
 from colmap_tco.progress import Progress
 from tco.config import knob
@@ -28,7 +29,9 @@ class ExampleConfig:
     """What the example does."""
 
     failure: str = knob(
-        "none", "how to fail", choices=("none", "interrupt", "terminate", "environment", *"abcdefgh")
+        "none",
+        "how to fail",
+        choices=("none", "interrupt", "terminate", "terminate with COLMAP", "environment", *"abcdefgh"),
     )
     mask_path: Path | None = knob(None, "folder of masks")
     overwrite: bool = knob(False, "replace earlier results")
@@ -81,7 +84,9 @@ def run(workspace: Path, config: ExampleConfig, progress: Progress) -> Result | 
         return Environment()
     if config.failure == "interrupt":
         os.kill(os.getpid(), signal.SIGINT)
-    if config.failure == "terminate":
+    if config.failure == "terminate with COLMAP":
+        _pycolmap.load()
+    if config.failure.startswith("terminate"):
         os.kill(os.getpid(), signal.SIGTERM)
     if config.failure in ERRORS:
         raise ERRORS[config.failure]

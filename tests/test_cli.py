@@ -65,6 +65,7 @@ def test_success_prints_the_summary_on_stdout_alone() -> None:
         ("h", 3, "scene/mesh.ply: the system refuses it (Read-only file system)"),
         ("interrupt", 130, "interrupted"),
         ("terminate", 130, "stopped by SIGTERM"),
+        ("terminate with COLMAP", 130, "stopped by SIGTERM"),
     ],
 )
 def test_each_failure_has_its_exit_code_and_one_sentence(failure: str, code: int, told: str) -> None:

@@ -23,7 +23,7 @@ from colmap_tco.priors import (
     chunk_frame,
     held_out,
 )
-from colmap_tco.tracks import Tracks, read_tracks
+from colmap_tco.tracks import OVERLAPS, Tracks, covisibility, read_tracks
 from colmap_tco.views import View, ViewConfig, canvas_cameras, canvas_size, make_views, original_from_network
 from colmap_tco.workspace import open_workspace
 from tco.geometry import project, rays, transform
@@ -68,6 +68,17 @@ def test_a_chunk_has_unit_depth_and_its_first_view_as_world(mixed: Path) -> None
     assert priors.sparse is not None
     assert torch.allclose(priors.cameras.world_from_cam[0], torch.eye(4), atol=1e-6)
     assert torch.cat([sparse.depth for sparse in priors.sparse]).median() == pytest.approx(1, abs=0.02)
+
+
+@pytest.mark.parametrize("by", OVERLAPS)
+def test_views_overlap_as_the_settings_say(by: str, mixed: Path) -> None:
+    tracks, views = load(mixed)
+    pairs = covisibility(tracks, [view.image_id for view in views])
+    priors = build_priors(tracks, views, chunk_frame(tracks, views), PriorConfig(overlap_by=by)).optimise
+    assert priors.overlap is not None
+    np.testing.assert_allclose(priors.overlap, pairs.overlap(by), rtol=1e-6)
+    others = [pairs.overlap(other) for other in OVERLAPS if other != by]
+    assert not any(np.allclose(priors.overlap, other, rtol=1e-2) for other in others)
 
 
 def test_held_out_tracks_are_nowhere_in_the_optimisation(mixed: Path) -> None:
