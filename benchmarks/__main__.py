@@ -70,6 +70,8 @@ TABLES = (
     Table("quality-colour", "quality", "quality.md",
           ("--sets", *UNTUNED, "--baselines", "--steps", "2", "--plane_colour", "0"),
           "colours of kept depths aside"),
+    Table("quality-number", "quality", "quality.md",
+          (*_ALL, *UNTUNED, "--baselines", "--steps", "2", "--overlap_by", "number"), "sources by number"),
     Table("stretches", "unseen", "quality.md", (), "stretches"),
     Table("quality-steps", "quality", "quality.md",
           ("--baselines", "--steps", "1", "5", "20"), "more steps"),
@@ -84,6 +86,11 @@ TABLES = (
     Table("ablations-default", "ablations", "ablations.md",
           ("--size", "320", "--views", "0", "--steps", "2", "--only", "densify does,the same"), "full size"),
     Table("noise", "noise", "noise.md", (*_THREE, "--steps", "12")),
+    *(
+        Table(f"noise-{steps}", "noise", "noise.md",
+              (*_THREE, "--steps", steps, "--rows", "2"), f"{steps} steps")
+        for steps in ("2", "5", "12")
+    ),
     Table("noise-rendered", "noise", "noise.md", (*_THREE, "--steps", "12", "--sets", "hills", "walk"),
           "rendered scenes"),
     Table("noise-told", "noise", "noise.md",
