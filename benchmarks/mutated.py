@@ -501,20 +501,25 @@ MUTATIONS = [
         ("images=views.images.mean(1, keepdim=True)", "images=views.images[:, :1]"),
     ),
     *(
-        Mutation("colmap_tco/tracks.py", old, new, ("tests/colmap_tco/test_tracks.py",))
+        Mutation("colmap_tco/overlap.py", old, new, ("tests/colmap_tco/test_overlap.py",))
         for old, new in (
-            ("np.sqrt(self.common * self.score), self.common", "self.common, self.common"),
-            ("NARROW, WIDE)) ** 2", "WIDE, NARROW)) ** 2"),
-            ("centres[a] - xyz[p], centres[b] - xyz[p]", "centres[a] - xyz[p], centres[a] - xyz[p]"),
+            ("known += worth[best]", "known = known"),
+            ("centres[i] - xyz[mine], centres[:, None]", "centres[:, None] - xyz[mine], centres[:, None]"),
+            ("_added(np.sqrt(worth))", "_added(worth)"),
+            ("np.log1p(worth[best] / known)", "np.log1p(worth[best])"),
+            ("    common[i] = 0\n", ""),
+            ("if fresh or all(now >=", "if fresh or any(now >="),
         )
     ),
+    Mutation("colmap_tco/tracks.py", "NARROW, WIDE)) ** 2", "WIDE, NARROW)) ** 2",
+             ("tests/colmap_tco/test_tracks.py",)),
     *(
         Mutation(file, old, new, (tests,))
         for file, old, new, tests in (
-            ("colmap_tco/priors.py", "overlap(config.overlap_by)", "overlap()",
+            ("colmap_tco/priors.py", "tracks.xyz, config.overlap_by)", "tracks.xyz)",
              "tests/colmap_tco/test_priors.py"),
             ("colmap_tco/_pycolmap.py", "with sigterm_kept():", "if True:", "tests/test_cli.py"),
-            ("training/dataset.py", "pairs.overlap()", 'pairs.overlap("number")',
+            ("training/dataset.py", "pose[:, :3, 3], tracks.xyz)", 'pose[:, :3, 3], tracks.xyz, "number")',
              "tests/training/test_dataset.py"),
         )
     ),

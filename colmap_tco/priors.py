@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from colmap_tco._pycolmap import Floats, Ints, Mask, focal_lengths
 from colmap_tco.errors import InputError
-from colmap_tco.tracks import OVERLAPS, Tracks, covisibility
+from colmap_tco.overlap import OVERLAPS, overlap
+from colmap_tco.tracks import Tracks, observed
 from colmap_tco.views import (
     ChunkFrame,
     View,
@@ -63,9 +64,10 @@ class PriorConfig:
     )
     focal_sigma: float = knob(0.005, "relative standard deviation of the focal lengths")
     overlap_by: str = knob(
-        "both",
+        "information",
         "which views are matched with each other. number: those that share the most points; angle: the most "
-        "by MVSNet's weight of the triangulation angle; both: by the geometric mean of the two",
+        "by MVSNet's weight of the triangulation angle; information: one after the other what adds most to "
+        "those before it by that weight, so that no part of the picture is without",
         choices=OVERLAPS,
     )
     pose_covariance: bool = knob(
@@ -203,11 +205,11 @@ def build_priors(
     held = [held_out(points.track, config.holdout, seed) for points in seen]
     depth = np.array([np.median(points.depth) if len(points.depth) else 1.0 for points in seen])
     rotation, centre = _pose_sigmas(tracks, views, depth, frame.scale, config)
-    overlap = covisibility(tracks, [view.image_id for view in views]).overlap(config.overlap_by)
+    told = overlap(*observed(tracks, [view.image_id for view in views]), tracks.xyz, config.overlap_by)
     priors = Priors(
         cameras=canvas_cameras(views, frame),
         sparse=tuple(points.tensors(~mask) for points, mask in zip(seen, held, strict=True)),
-        overlap=torch.from_numpy(overlap).float(),
+        overlap=torch.from_numpy(told).float(),
         rotation_sigma=torch.from_numpy(rotation).float(),
         centre_sigma=torch.from_numpy(centre).float(),
         focal_sigma=torch.full((len(views),), config.focal_sigma),

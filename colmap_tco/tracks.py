@@ -64,10 +64,6 @@ class Tracks:
     deviations: Mapping[int, tuple[float, float]] = field(default_factory=dict)
 
 
-OVERLAPS = ("both", "number", "angle")
-"""Ways to say how well two views overlap; see :meth:`Covisibility.overlap`."""
-
-
 @dataclass(frozen=True)
 class Covisibility:
     """How much pairs of views share; symmetric, zero on the diagonal.
@@ -79,21 +75,6 @@ class Covisibility:
 
     common: Ints
     score: Floats
-
-    def overlap(self, by: str = "both") -> Floats:
-        """How well two views tell each other's depths (V, V).
-
-        By ``both``, the geometric mean of the two, it is much that they share, seen from directions that tell
-        its depth. The ``number`` alone favours neighbours in a film, that hardly differ; the score by
-        ``angle`` alone leaves next to nothing of pairs that are nearer than 5°.
-
-        Raises:
-            ValueError: there is no such way, see :data:`OVERLAPS`.
-        """
-        if by not in OVERLAPS:
-            raise ValueError(f"views overlap by one of {', '.join(OVERLAPS)}, not by {by!r}")
-        ways = dict(zip(OVERLAPS, (np.sqrt(self.common * self.score), self.common, self.score), strict=True))
-        return ways[by].astype(float)
 
 
 def read_tracks(model: Model, level: int = logging.DEBUG) -> Tracks:
@@ -206,35 +187,37 @@ def inverse(information: Floats) -> Floats:
 
 
 def covisibility(tracks: Tracks, image_ids: Sequence[int]) -> Covisibility:
-    """Common points of every pair of images of a model; see :func:`counted`."""
-    points = [tracks.images[i].point for i in image_ids]
-    return counted(points, np.stack([tracks.centres[i] for i in image_ids]), tracks.xyz)
-
-
-def counted(points: Sequence[Ints], centres: Floats, xyz: Floats) -> Covisibility:
-    """Common points of every pair of V views, plainly counted and weighted.
-
-    The weight of a point with triangulation angle θ is exp(−(θ − 5°)² / 2σ²), σ = 1° below 5° and 10°
-    above (MVSNet, Yao et al. 2018, section 4.1): narrower pairs give no depth, wider ones look
-    different.
-
-    Args:
-        points: indices of those that each view observes.
-        centres: (V, 3) of the cameras.
-        xyz: (P, 3) of the points.
-    """
+    """Common points of every pair of images, plainly counted and weighted by :func:`angle_weight`."""
+    points, centres = observed(tracks, image_ids)
     size = len(points)
     views = np.concatenate([np.full(len(seen), v) for v, seen in enumerate(points)])
     common, score = np.zeros(size * size, np.int64), np.zeros(size * size)
     for p, a, b in _pairs(np.concatenate(points), views):
-        to_a, to_b = centres[a] - xyz[p], centres[b] - xyz[p]
-        cosine = (to_a * to_b).sum(1) / (np.linalg.norm(to_a, axis=1) * np.linalg.norm(to_b, axis=1))
-        angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-        weight = np.exp(-0.5 * ((angle - BEST_ANGLE) / np.where(angle <= BEST_ANGLE, NARROW, WIDE)) ** 2)
+        weight = angle_weight(centres[a] - tracks.xyz[p], centres[b] - tracks.xyz[p])
         common += np.bincount(a * size + b, minlength=size * size)
         score += np.bincount(a * size + b, weight, minlength=size * size)
     counts, weights = common.reshape(size, size), score.reshape(size, size)
     return Covisibility(counts + counts.T, weights + weights.T)
+
+
+def observed(tracks: Tracks, image_ids: Sequence[int]) -> tuple[list[Ints], Floats]:
+    """Indices of the points that each of V images observes, and where these were taken from (V, 3)."""
+    return [tracks.images[i].point for i in image_ids], np.stack([tracks.centres[i] for i in image_ids])
+
+
+def angle_weight(to_one: Floats, to_other: Floats) -> Floats:
+    """What a triangulation angle θ is worth, by MVSNet (Yao et al. 2018, section 4.1).
+
+    It is exp(−(θ − 5°)² / 2σ²), σ = 1° below 5° and 10° above: narrower pairs give no depth, wider ones look
+    different.
+
+    Args:
+        to_one, to_other: (..., 3) from points to two cameras.
+    """
+    length = np.linalg.norm(to_one, axis=-1) * np.linalg.norm(to_other, axis=-1)
+    angle = np.degrees(np.arccos(np.clip((to_one * to_other).sum(-1) / length, -1, 1)))
+    weight: Floats = np.exp(-0.5 * ((angle - BEST_ANGLE) / np.where(angle <= BEST_ANGLE, NARROW, WIDE)) ** 2)
+    return weight
 
 
 def _pairs(point: Ints, views: Ints) -> Iterator[tuple[Ints, Ints, Ints]]:

@@ -164,8 +164,8 @@ class Priors(_Movable):
         cameras: poses and intrinsics.
         sparse: one :class:`SparseDepth` a view.
         depth: (V, H, W) dense depth, 0 where there is none.
-        overlap: (V, V) how well two views tell each other's depths, by what they share and how far apart they
-            are; 0 where they share nothing, and on the diagonal.
+        overlap: (V, V) at [i, j] how much view j tells of the depths of view i; 0 where they share nothing,
+            and on the diagonal.
         rotation_sigma: (V,) standard deviation of the pose prior's rotation about each axis, radians.
         centre_sigma: (V,) standard deviation of the camera centre along each axis, in units of length.
         focal_sigma: (V,) standard deviation of the relative focal length.

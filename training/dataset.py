@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 from torch import Tensor
 
-from colmap_tco.tracks import counted
+from colmap_tco.overlap import overlap
 from tco.types import Cameras, Priors, SparseDepth, Views
 from training.photo import photographed
 from training.raytrace import Floats
@@ -163,7 +163,7 @@ def assemble(s: Sample, images: Floats, tracks: Tracks) -> tuple[Views, Priors, 
         depths.append(cam[ok, 2])
     unit = float(np.median(np.concatenate(depths)))
     pose = np.linalg.inv(cams)
-    pairs = counted([np.flatnonzero(seen) for seen in tracks.seen], pose[:, :3, 3], tracks.xyz)
+    told = overlap([np.flatnonzero(seen) for seen in tracks.seen], pose[:, :3, 3], tracks.xyz)
     pose = np.linalg.inv(pose[0]) @ pose
     pose[:, :3, 3] /= unit
     f = torch.float32
@@ -180,8 +180,8 @@ def assemble(s: Sample, images: Floats, tracks: Tracks) -> tuple[Views, Priors, 
     x = torch.as_tensor(images, dtype=f).permute(0, 3, 1, 2).contiguous()
     names = tuple(str(i) for i in range(v))
     views = Views(x, torch.ones(x.shape[0], *x.shape[2:], dtype=torch.bool), names)
-    overlap = torch.as_tensor(pairs.overlap(), dtype=f)
-    return views, Priors(cameras, points, overlap=overlap), torch.as_tensor(s.depth / unit, dtype=f)
+    priors = Priors(cameras, points, overlap=torch.as_tensor(told, dtype=f))
+    return views, priors, torch.as_tensor(s.depth / unit, dtype=f)
 
 
 def jittered(s: Sample, rng: np.random.Generator) -> Sample:

@@ -10,7 +10,7 @@ import pytest
 
 from colmap_tco import _pycolmap
 from colmap_tco.errors import InputError
-from colmap_tco.tracks import PIXEL_FLOOR, Tracks, counted, covisibility, read_tracks
+from colmap_tco.tracks import PIXEL_FLOOR, Tracks, covisibility, read_tracks
 from tests.conftest import Shot, write_text_model
 
 FOCAL = 200.0
@@ -104,21 +104,6 @@ def test_common_points_and_scores_are_what_counting_gives(
             score = sum(np.exp(-((t - 5) ** 2) / (2 if t <= 5 else 200)) for t in angle)
             assert pairs.common[a, b] == len(both)
             assert pairs.score[a, b] == pytest.approx(score, rel=1e-9)
-            assert pairs.overlap()[a, b] == pytest.approx(np.sqrt(len(both) * score), rel=1e-9)
-
-
-def test_views_farther_apart_overlap_more_than_neighbours_in_a_film(tmp_path: Path) -> None:
-    """Ten points 4 m away: 0.5° apart all of them are shared, 5° apart nine, 40° apart nine."""
-    xyz = np.tile([0.0, 0, 4], (10, 1))
-    centres = np.array([[4 * np.tan(np.radians(t)), 0, 0] for t in (0, 0.5, 5, 40)])
-    pairs = counted([np.arange(10), np.arange(10), np.arange(9), np.arange(9)], centres, xyz)
-    overlap = pairs.overlap()
-    assert overlap[0, 2] == pytest.approx(9) and (overlap == overlap.T).all() and not overlap.diagonal().any()
-    assert overlap[0, 2] > overlap[0, 3] > overlap[0, 1] > 0
-    assert pairs.overlap("number")[0].tolist() == [0, 10, 9, 9]
-    assert np.array_equal(pairs.overlap("angle"), pairs.score)
-    with pytest.raises(ValueError, match="both, number, angle, not by 'size'"):
-        pairs.overlap("size")
 
 
 def test_real_models_are_read_whole(shared: Path) -> None:
