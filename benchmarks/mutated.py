@@ -497,7 +497,7 @@ MUTATIONS = [
     *_of(
         "tco/terms.py",
         "polish",
-        ("views if config.polish.polish_colours else grey(views)", "views"),
+        ("return views if wanted else", "return"),
         ("images=views.images.mean(1, keepdim=True)", "images=views.images[:, :1]"),
     ),
     *(

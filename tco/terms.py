@@ -85,7 +85,7 @@ class Terms:
             self._check_depth()
         if self.given is not None and config.sparse_weight > 0 and priors.sparse is None:
             raise ValueError("sparse_weight is set and there are no sparse points among the priors")
-        self.looked_up = views if config.polish.polish_colours else grey(views)
+        self.looked_up = in_colours(views, config.polish.polish_colours)
         self.sparse = priors.sparse or (_no_points(views.images),) * len(views)
         alike = torch.ones(len(views), len(views)).fill_diagonal_(0)
         self.overlap = alike if priors.overlap is None else priors.overlap
@@ -244,9 +244,9 @@ def comparison(config: TCOConfig) -> tuple[ObjectiveConfig, SurfelConfig]:
     return objective, SurfelConfig(a.radius_factor, confident_opacity=a.confident_opacity)
 
 
-def grey(views: Views) -> Views:
-    """The views with the mean of their colours, images (V, 1, H, W)."""
-    return replace(views, images=views.images.mean(1, keepdim=True))
+def in_colours(views: Views, wanted: bool) -> Views:
+    """The views with all their colours if wanted, else with the mean of these, images (V, 1, H, W)."""
+    return views if wanted else replace(views, images=views.images.mean(1, keepdim=True))
 
 
 def errors_at(depth: Tensor, points: SparseDepth) -> Tensor:
