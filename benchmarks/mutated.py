@@ -504,10 +504,10 @@ MUTATIONS = [
         Mutation("colmap_tco/overlap.py", old, new, ("tests/colmap_tco/test_overlap.py",))
         for old, new in (
             ("known += worth[best]", "known = known"),
-            ("centres[i] - xyz[mine], centres[:, None]", "centres[:, None] - xyz[mine], centres[:, None]"),
+            ("centres[i] - place, centres[views]", "centres[views] - place, centres[views]"),
             ("_added(np.sqrt(worth))", "_added(worth)"),
             ("np.log1p(worth[best] / known)", "np.log1p(worth[best])"),
-            ("    common[i] = 0\n", ""),
+            ("    common[i] = False\n", ""),
             ("if fresh or all(now >=", "if fresh or any(now >="),
         )
     ),

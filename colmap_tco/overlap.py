@@ -44,11 +44,14 @@ def overlap(points: Sequence[Ints], centres: Floats, xyz: Floats, by: str = OVER
 def _row(i: int, seen: Mask, centres: Floats, xyz: Floats, by: str) -> Floats:
     """What all views tell of view i (V,)."""
     mine = np.flatnonzero(seen[i])
-    common = seen[:, mine].astype(float)
-    common[i] = 0
+    common = seen[:, mine]
+    common[i] = False
     if by == "number":
-        return common.sum(1)
-    worth = common * angle_weight(centres[i] - xyz[mine], centres[:, None] - xyz[mine])
+        return common.sum(1).astype(float)
+    worth = np.zeros(common.shape)
+    views, at = np.nonzero(common)
+    place = xyz[mine[at]]
+    worth[views, at] = angle_weight(centres[i] - place, centres[views] - place)
     return worth.sum(1) if by == "angle" else _added(np.sqrt(worth))
 
 
