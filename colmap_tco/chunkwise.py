@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -102,6 +103,8 @@ def predict_chunks(
                     "loss": outputs.plain(attempt.result.history),
                 }
             )
+            if len(plan.chunks) > 1:
+                gc.collect()
             start = time.monotonic()
             progress.reach(sum(result.is_done(scene.views[i].name) for c in todo for i in c.owned))
     return failed

@@ -27,6 +27,7 @@ from colmap_tco.flags import given_flags
 from colmap_tco.fusion import EmptyCloudError, FusionConfig, fuse
 from colmap_tco.lock import locked
 from colmap_tco.mapping import MappingConfig, ensure_model
+from colmap_tco.memory import cycles_left
 from colmap_tco.origin import origin_of
 from colmap_tco.page.write import write_page
 from colmap_tco.pose_covariance import with_deviations
@@ -131,7 +132,7 @@ def densify(
     """
     root = existing_root(root)
     progress = progress or Progress()
-    with locked(root):
+    with locked(root), cycles_left():
         bare = _begin(root, config, progress)  # before torch is imported, which takes seconds
         with limited_threads(config.num_threads):
             done = _densify(root, config, bare, progress)

@@ -25,7 +25,10 @@ class Fusing:
     """
 
     def __init__(
-        self, layers: nn.Sequential, mixed: Callable[[torch.device], AbstractContextManager[object]]
+        self,
+        layers: nn.Sequential,
+        mixed: Callable[[torch.device], AbstractContextManager[object]],
+        into: Tensor | None = None,
     ) -> None:
         """With nothing added yet.
 
@@ -33,8 +36,10 @@ class Fusing:
             layers: a linear layer from G + 2 numbers, a ReLU, and a linear layer to C + 1: the channels and
                 the logarithm of their weight.
             mixed: products are computed in its type inside it.
+            into: (..., C) where to make the result, without gradients; a new tensor by default.
         """
-        self.layers, self.mixed = layers, mixed
+        self.layers, self.mixed, self.into = layers, mixed, into
+        self.looped = False
         self.total: Tensor | None = None
         self.weights: Tensor | None = None
 
@@ -61,11 +66,13 @@ class Fusing:
         """The same of numpy's arrays, in place."""
         from tco.backbones._fuse_kernels import Layers, fuse
 
+        self.looped = True
         first, last = self.layers[0], self.layers[-1]
         assert isinstance(first, nn.Linear) and isinstance(last, nn.Linear)
         groups, channels = correlations.shape[-1], last.out_features - 1
         if self.total is None or self.weights is None:
-            self.total = correlations.new_zeros((*seen.shape, channels))
+            shape = (*seen.shape, channels)
+            self.total = correlations.new_zeros(shape) if self.into is None else self.into.zero_()
             self.weights = seen.new_zeros((*seen.shape, 1))
         into, bias, out, out_bias = (
             p.detach().float().numpy() for p in (first.weight, first.bias, last.weight, last.bias)
@@ -88,4 +95,7 @@ class Fusing:
         """
         if self.total is None or self.weights is None:
             raise ValueError("nothing was added that could be fused")
-        return self.total / (self.weights + NONE)
+        if self.looped:
+            return self.total.div_(self.weights.add_(NONE))
+        result = self.total / (self.weights + NONE)
+        return result if self.into is None else self.into.copy_(result)

@@ -84,8 +84,10 @@ class Stage:
 
 
 def joined(stages: Sequence[Stage]) -> Stage:
-    """One batch of several, without scores."""
-    return Stage(torch.cat([s.inverse for s in stages]), torch.cat([s.log_error for s in stages]))
+    """One batch of several, with scores if all have them."""
+    scores = [s.scores for s in stages if s.scores is not None]
+    every = torch.cat(scores) if len(scores) == len(stages) else None
+    return Stage(torch.cat([s.inverse for s in stages]), torch.cat([s.log_error for s in stages]), every)
 
 
 def channels_last(module: nn.Module) -> None:
@@ -150,15 +152,9 @@ class Sweep(nn.Module):
         sources = order[:, : min(max_sources, len(views) - 1)]
         index = torch.arange(self.config.planes, device=lo.device, dtype=lo.dtype)
         planes = (lo[:, None] + step[:, None] * index)[..., None, None]
-        every, cameras = range(len(views)), priors.cameras
-        parts = _in_blocks(
-            lambda b: self._volume(coarse, cameras, every[b], sources[b], planes[b]),
-            len(views),
-            coarse[0, 0].numel() * self.config.planes,
-            coarse.device,
-        )
+        volume = self._volumes(coarse, priors.cameras, sources, planes)
         quarter, half = (interpolate_points(priors.sparse, views.size, s, views.images) for s in (4, 2))
-        return Encoded(torch.cat(parts), fine, context, lo, step, sources, cameras, (quarter, half))
+        return Encoded(volume, fine, context, lo, step, sources, priors.cameras, (quarter, half))
 
     def _features(self, images: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
         """Of all views (V, 3, H, W): those of the coarse and of the fine sweep, and context."""
@@ -182,17 +178,36 @@ class Sweep(nn.Module):
         )
         return replace(encoded, hints=(quarter, half))
 
+    def _volumes(self, features: Tensor, cameras: Cameras, sources: Tensor, planes: Tensor) -> Tensor:
+        """Correlations (V, D, h, w, C) of all views, fused by attention over their sources per hypothesis.
+
+        Without gradients they are made in place, so that the network's largest tensor is there once.
+        """
+        every, (h, w) = range(len(features)), features.shape[-2:]
+        shape, volume = (len(every), planes.shape[1], h, w, self.config.volume), None
+        if not torch.is_grad_enabled():
+            volume = planes.new_empty(shape, dtype=torch.promote_types(features.dtype, planes.dtype))
+
+        def some(b: slice) -> Tensor:
+            into = None if volume is None else volume[b]
+            return self._volume(features, cameras, every[b], (sources[b], planes[b]), into)
+
+        parts = _in_blocks(some, len(every), planes.shape[1] * h * w, features.device)
+        return torch.cat(parts) if volume is None else volume
+
     def _volume(
-        self, features: Tensor, cameras: Cameras, views: Sequence[int], sources: Tensor, planes: Tensor
-    ) -> Tensor:
-        """Correlations (B, D, h, w, C) of some views, fused by attention over their sources per hypothesis.
+        self, features: Tensor, cameras: Cameras, views: Sequence[int], swept: tuple[Tensor, Tensor],
+        into: Tensor | None,
+    ) -> Tensor:  # fmt: skip
+        """Those of some views, of their (B, S) sources and (B, D, 1, 1) planes, in ``into`` if that is given.
 
         A softmax accumulated source by source, so that memory does not grow with their number; where no
         source sees a hypothesis the result is 0.
         """
+        sources, planes = swept
         relative = relative_cameras(cameras, views, sources, 4)
         reference = torch.as_tensor(list(views), device=sources.device)
-        fusing = Fusing(self.fuse, self.mixed)
+        fusing = Fusing(self.fuse, self.mixed, into)
         for s in range(sources.shape[1]):
             pairs = torch.stack([reference, sources[:, s]], 1)
             fusing.add(*correlate(features, pairs, relative[:, s], planes, self.config.groups[0]))
@@ -257,26 +272,22 @@ class Sweep(nn.Module):
     def coarse(self, encoded: Encoded, views: Sequence[int]) -> Stage:
         """First stage of some views, at 1/4 of the resolution."""
         cells, device = encoded.volume[0, ..., 0].numel(), encoded.volume.device
-        parts = _in_blocks(lambda b: self._scores(encoded, views[b]), len(views), cells, device)
-        scores = torch.cat(parts)
-        v = torch.as_tensor(list(views), device=encoded.lo.device)
-        lo, step = encoded.lo[v].view(-1, 1, 1), encoded.step[v].view(-1, 1, 1)
-        planes = lo + step * torch.arange(scores.shape[1], device=lo.device, dtype=lo.dtype).view(1, -1, 1)
-        index, mass = soft_argmax(scores, (planes < BACKGROUND * lo).squeeze(-1))
-        inverse = lo + step * index
-        error = (step / inverse * (0.3 + 3 * (1 - mass))).log()
-        return Stage(inverse, error, scores)
+        return joined(_in_blocks(lambda b: self._swept(encoded, views[b]), len(views), cells, device))
 
-    def _scores(self, encoded: Encoded, views: Sequence[int]) -> Tensor:
-        """Plane scores (B, D, h, w) of a few views."""
-        v = torch.as_tensor(list(views), device=encoded.lo.device)
+    def _swept(self, encoded: Encoded, views: Sequence[int]) -> Stage:
+        """First stage of a few views."""
+        v = _index(views, encoded.lo.device)
         lo, step = encoded.lo[v].view(-1, 1, 1), encoded.step[v].view(-1, 1, 1)
         hints = encoded.hints[0][v].as_volume(lo, step, self.config.planes)
         volume = torch.cat([encoded.volume[v], hints], -1).permute(0, 4, 1, 2, 3)
         _, quarter, eighth, sixteenth = (c[v] for c in encoded.context)
         with self.mixed(volume.device):
             scores: Tensor = self.head.coarse(volume, (quarter, eighth, sixteenth))
-        return scores
+        planes = lo + step * torch.arange(scores.shape[1], device=lo.device, dtype=lo.dtype).view(1, -1, 1)
+        index, mass = soft_argmax(scores, (planes < BACKGROUND * lo).squeeze(-1))
+        inverse = lo + step * index
+        error = (step / inverse * (0.3 + 3 * (1 - mass))).log()
+        return Stage(inverse, error, scores)
 
     def refine(self, k: int, encoded: Encoded, views: Sequence[int], stage: Stage, world: Stage) -> Stage:
         """Pass ``k`` of the refinement of some views, given half-resolution depths of all views."""
@@ -303,12 +314,13 @@ class Sweep(nn.Module):
         relative = relative_cameras(encoded.cameras, views, encoded.sources[v], 2)
         matching = self._matching(encoded, v, relative, planes)
         agreement = agree(planes, relative, encoded.sources[v], world.inverse, world.log_error)
-        hints = encoded.hints[1][v]
+        rows = _index(views, v.device)
+        hints = encoded.hints[1][rows]
         bump, near = hints.at(planes, step)
         sure = torch.stack([stage.log_error.detach(), (step / start).log()], 1)
         x = torch.cat([matching, agreement, bump, near, sure, hints.distance.unsqueeze(1)], 1)
         x = x.contiguous(memory_format=torch.channels_last)
-        half, quarter, eighth, _ = (m[v] for m in encoded.context)
+        half, quarter, eighth, _ = (m[rows] for m in encoded.context)
         with self.mixed(x.device):
             scores, extra, mask = self.head.refine[k](x, (half, quarter, eighth))
         moved = (scores.softmax(1) * offset).sum(1) + extra[:, 0]
@@ -354,6 +366,13 @@ def _in_blocks(
     """Results of a task of so many views in groups, of so many cells each; at least one view a group."""
     per = max(1, (BATCH if device.type == "cpu" else LARGE_BATCH) // cells)
     return side_by_side(task, [slice(k, min(k + per, views)) for k in range(0, views, per)], device)
+
+
+def _index(views: Sequence[int], device: torch.device) -> Tensor | slice:
+    """Of rows of tensors: a slice, which copies nothing, where the views follow one another."""
+    if list(views) == list(range(views[0], views[-1] + 1)):
+        return slice(views[0], views[-1] + 1)
+    return torch.as_tensor(list(views), device=device)
 
 
 def _world(context: Prediction) -> Stage:

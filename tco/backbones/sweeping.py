@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from tco.geometry import invert, pixel_grid
+from tco.parallel import side_by_side
 from tco.types import Cameras, SparseDepth
 
 
@@ -116,8 +117,8 @@ def interpolate_points(
     h, w = size[0] // factor, size[1] // factor
     grid = pixel_grid(h, w, like).reshape(-1, 2) * factor
     unit = max(size) / 160
-    nearest, smooth, distance = [], [], []
-    for points in sparse:
+
+    def of_view(points: SparseDepth) -> tuple[Tensor, Tensor, Tensor]:
         pick = torch.linspace(0, len(points) - 1, min(len(points), 1500)).round().long()
         xy, inv, sigma = (
             points.xy[pick].to(like),
@@ -127,11 +128,11 @@ def interpolate_points(
         d, index = nearest_points(grid, xy, min(6, len(pick)))
         d = d / unit
         weight = 1 / (1 + d**2) / sigma[index].clamp_min(1e-3)
-        nearest.append(inv[index[:, 0]])
-        smooth.append((weight * inv[index]).sum(1) / weight.sum(1))
-        distance.append(torch.log1p(d[:, 0]))
-    stacked = (torch.stack(x).reshape(len(sparse), h, w) for x in (nearest, smooth, distance))
-    return Hints(*stacked)
+        mean = (weight * inv[index]).sum(1) / weight.sum(1)
+        return inv[index[:, 0]], mean, torch.log1p(d[:, 0])
+
+    parts = side_by_side(of_view, sparse, like.device)
+    return Hints(*(torch.stack(x).reshape(len(sparse), h, w) for x in zip(*parts, strict=True)))
 
 
 def nearest_points(places: Tensor, xy: Tensor, count: int) -> tuple[Tensor, Tensor]:

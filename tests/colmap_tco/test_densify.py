@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import json
 import os
@@ -390,6 +391,24 @@ def test_corrected_cameras_keep_the_precision_of_map_coordinates(fresh_room: Roo
         a, b = (-pose[name][:, :3].T @ pose[name][:, 3] for pose in (ours, theirs))
         assert np.linalg.norm(a - b) == pytest.approx(figures["correction"]["centre"], rel=0.01, abs=1e-6)
     assert_accurate(fresh_room, result.folder)
+
+
+def test_nothing_large_waits_for_a_search_for_cycles(fresh_room: Room) -> None:
+    """A run searches for none, so that what it let go of must be free without."""
+    import torch
+
+    gc.collect()
+    gc.disable()
+    try:
+        assert made(fresh_room.root, config(steps=2)).fresh
+        gc.set_debug(gc.DEBUG_SAVEALL)
+        gc.collect()
+        large = [thing for thing in gc.garbage if isinstance(thing, (torch.Tensor, np.ndarray))]
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        gc.enable()
+    assert not large
 
 
 def test_images_that_cannot_be_used_are_left_out_and_named(fresh_room: Room) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import os
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,7 @@ from colmap_tco.memory import (
     Footprint,
     _left_in_container,
     chunk_limit,
+    cycles_left,
     footprint,
     free_memory,
     recomputed,
@@ -248,3 +251,27 @@ def test_a_real_allocation_that_fails_is_survived() -> None:
 
     done = list(within_memory(plan_chunks(common, 8).chunks, common, work, lambda: 8, held.clear))
     assert not held and all(attempt.result for attempt in done)
+
+
+class Ring:
+    """An object that holds itself, so that only a search for cycles frees it."""
+
+    def __init__(self) -> None:
+        self.me = self
+
+
+def test_cycles_are_searched_for_after_the_block_and_not_in_it() -> None:
+    assert gc.isenabled()
+    with pytest.raises(ValueError, match="any"), cycles_left():
+        ring = weakref.ref(Ring())
+        many = [[] for _ in range(200_000)]  # enough to begin a search of all generations
+        assert ring() is not None and len(many) == 200_000 and not gc.isenabled()
+        raise ValueError("any")
+    assert gc.isenabled()
+    gc.disable()
+    try:
+        with cycles_left():
+            pass
+        assert not gc.isenabled()  # as whoever called had it
+    finally:
+        gc.enable()
