@@ -81,8 +81,8 @@ class Fusing:
         mean = into[:, groups + 1 :] / groups
         layers = Layers(np.ascontiguousarray(into[:, :groups] + mean), bias + into[:, groups], out, out_bias)
         cells = correlations.contiguous().numpy().reshape(-1, groups)
-        there, total = seen.contiguous().numpy().reshape(-1), self.total.numpy().reshape(-1, channels)
-        weights = self.weights.numpy().reshape(-1)
+        there, total = seen.contiguous().numpy().reshape(-1), self.total.view(-1, channels).numpy()
+        weights = self.weights.view(-1).numpy()
         in_ranges(
             lambda a, b: fuse(cells[a:b], there[a:b], layers, total[a:b], weights[a:b], MOST), len(cells)
         )

@@ -71,6 +71,26 @@ def test_it_is_a_softmax_over_the_sources_that_see_a_cell(loops: bool) -> None:
     assert nobody.any() and not nobody.all() and not found[nobody].any()
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["loops", "torch"])
+def test_the_result_is_made_where_it_is_wanted(dtype: torch.dtype) -> None:
+    net, parts = layers().to(dtype), [(a.to(dtype), b.to(dtype)) for a, b in said((4, 30))]
+    whole = torch.full((2, 4, 30, CHANNELS), torch.nan, dtype=dtype)
+    fusing = Fusing(net, lambda _: nullcontext(), whole[1])
+    with torch.no_grad():
+        for part in parts:
+            fusing.add(*part)
+        result = fusing.result()
+    assert result.data_ptr() == whole[1].data_ptr() and bool(whole[0].isnan().all())
+    torch.testing.assert_close(whole[1].float(), fused(layers(), said((4, 30)), False), rtol=1e-5, atol=1e-5)
+
+
+def test_a_place_whose_rows_do_not_follow_one_another_is_refused() -> None:
+    """Loops would write into a copy of it."""
+    into = torch.zeros(5, CHANNELS, 6).transpose(1, 2)
+    with torch.no_grad(), pytest.raises(RuntimeError, match="view"):
+        Fusing(layers(), lambda _: nullcontext(), into).add(*said((5, 6))[0])
+
+
 @pytest.mark.parametrize("loops", [True, False])
 def test_the_order_of_sources_is_of_no_account(loops: bool) -> None:
     parts = said((300,))

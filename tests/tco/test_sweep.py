@@ -257,11 +257,23 @@ def test_pixels_outside_the_mask_do_not_matter(network: Sweep, rendered: Rendere
 
 
 def test_batches_of_views_do_not_matter(
-    network: Sweep, encoded: Encoded, full: Prediction, monkeypatch: pytest.MonkeyPatch
+    network: Sweep, encoded: Encoded, full: Prediction, rendered: Rendered, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for cells in (1, 2 * encoded.volume[0, ..., 0].numel(), 10**9):
         monkeypatch.setattr(sweep, "BATCH", cells)
         assert_mostly_equal(network.decode(encoded).depth, full.depth, 1e-3, 0.999)
+        torch.testing.assert_close(network.encode(*rendered[:2]).volume, encoded.volume, rtol=0.02, atol=0.02)
+
+
+def test_volumes_are_alike_whether_gradients_are_recorded_or_not(
+    network: Sweep, encoded: Encoded, rendered: Rendered
+) -> None:
+    """In loops and in place without, by torch's operators and one after the other with them."""
+    with torch.enable_grad():
+        recorded = network.encode(*rendered[:2]).volume
+    assert recorded.requires_grad and not encoded.volume.requires_grad
+    off = (recorded - encoded.volume).abs()
+    assert float(off.mean()) < 0.01 * float(encoded.volume.abs().mean())
 
 
 def test_other_points_change_the_views_that_they_are_of(
