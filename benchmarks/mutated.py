@@ -507,10 +507,10 @@ MUTATIONS = [
     *(
         Mutation("colmap_tco/overlap.py", old, new, ("tests/colmap_tco/test_overlap.py",))
         for old, new in (
-            ("known += worth[best]", "known = known"),
+            ("known[at] += own", "known[at] += 0 * own"),
             ("centres[i] - place, centres[views]", "centres[views] - place, centres[views]"),
-            ("_added(np.sqrt(worth))", "_added(worth)"),
-            ("np.log1p(worth[best] / known)", "np.log1p(worth[best])"),
+            ("np.split(np.sqrt(worth), edges)", "np.split(worth, edges)"),
+            ("np.log1p(own / known[at])", "np.log1p(own)"),
             ("    common[i] = False\n", ""),
             ("if fresh or all(now >=", "if fresh or any(now >="),
         )

@@ -103,11 +103,16 @@ def predict_chunks(
                     "loss": outputs.plain(attempt.result.history),
                 }
             )
-            if len(plan.chunks) > 1:
-                gc.collect()
+            _collect_between(plan)
             start = time.monotonic()
             progress.reach(sum(result.is_done(scene.views[i].name) for c in todo for i in c.owned))
     return failed
+
+
+def _collect_between(plan: ChunkPlan) -> None:
+    """Free the cycles of garbage that a run else leaves (:func:`colmap_tco.memory.cycles_left`)."""
+    if len(plan.chunks) > 1:
+        gc.collect()
 
 
 def _loaded(chosen: Selected, config: TCOConfig) -> Backbone:

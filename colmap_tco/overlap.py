@@ -46,33 +46,39 @@ def _row(i: int, seen: Mask, centres: Floats, xyz: Floats, by: str) -> Floats:
     mine = np.flatnonzero(seen[i])
     common = seen[:, mine]
     common[i] = False
+    count = common.sum(1)
     if by == "number":
-        return common.sum(1).astype(float)
-    worth = np.zeros(common.shape)
+        return count.astype(float)
     views, at = np.nonzero(common)
     place = xyz[mine[at]]
-    worth[views, at] = angle_weight(centres[i] - place, centres[views] - place)
-    return worth.sum(1) if by == "angle" else _added(np.sqrt(worth))
+    worth = angle_weight(centres[i] - place, centres[views] - place)
+    if by == "angle":
+        return np.bincount(views, worth, len(seen)).astype(float)
+    edges = np.cumsum(count)[:-1]
+    return _added(np.split(at, edges), np.split(np.sqrt(worth), edges), len(mine))
 
 
-def _added(worth: Floats) -> Floats:
+def _added(points: Sequence[Ints], worth: Sequence[Floats], count: int) -> Floats:
     """What each of V views adds to those before it (V,), the next being the one that adds most.
 
     What a view adds falls as others are known, so that only the first in the order of what was found last
     has to be computed anew (Minoux 1978).
 
     Args:
-        worth: (V, N) of each point in each view.
+        points: indices of those that each of V views sees.
+        worth: of each of these in that view.
+        count: of all points.
     """
-    known, added = np.ones(worth.shape[1]), np.zeros(len(worth))
-    bound = np.log1p(worth).sum(1)
+    known, added = np.ones(count), np.zeros(len(points))
+    bound = np.array([np.log1p(own).sum() for own in worth])
     left = set(np.flatnonzero(bound > 0).tolist())
     while left:
         best = max(left, key=lambda view: (bound[view], -view))
-        now = float(np.log1p(worth[best] / known).sum())
+        at, own = points[best], worth[best]
+        now = float(np.log1p(own / known[at]).sum())
         fresh, bound[best] = now == bound[best], now
         if fresh or all(now >= bound[view] for view in left):
             added[best] = now
-            known += worth[best]
+            known[at] += own
             left.remove(best)
     return added
