@@ -512,7 +512,7 @@ MUTATIONS = [
             ("np.split(np.sqrt(worth), edges)", "np.split(worth, edges)"),
             ("np.log1p(own / known[at])", "np.log1p(own)"),
             ("    common[i] = False\n", ""),
-            ("if fresh or all(now >=", "if fresh or any(now >="),
+            ("if fresh or now >= bound.max()", "if fresh or now >= bound.min()"),
         )
     ),
     Mutation("colmap_tco/tracks.py", "NARROW, WIDE)) ** 2", "WIDE, NARROW)) ** 2",

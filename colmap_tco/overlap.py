@@ -71,14 +71,14 @@ def _added(points: Sequence[Ints], worth: Sequence[Floats], count: int) -> Float
     """
     known, added = np.ones(count), np.zeros(len(points))
     bound = np.array([np.log1p(own).sum() for own in worth])
-    left = set(np.flatnonzero(bound > 0).tolist())
-    while left:
-        best = max(left, key=lambda view: (bound[view], -view))
+    bound[bound <= 0] = -np.inf  # of which nothing is left to find
+    while np.isfinite(bound).any():
+        best = int(bound.argmax())
         at, own = points[best], worth[best]
         now = float(np.log1p(own / known[at]).sum())
         fresh, bound[best] = now == bound[best], now
-        if fresh or all(now >= bound[view] for view in left):
+        if fresh or now >= bound.max():
             added[best] = now
             known[at] += own
-            left.remove(best)
+            bound[best] = -np.inf
     return added
