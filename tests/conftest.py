@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from colmap_tco import _pycolmap
+from colmap_tco.cli import idle_threads_sleep
 from colmap_tco.errors import MissingError
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from tco.types import Priors, Views
     from training.scenes import Sample
 
+idle_threads_sleep()  # before torch is loaded: on a busy machine the suite else takes several times as long
 _pycolmap.load()  # in the order that keeps PNG writing alive, before any test module imports pycolmap
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as of a shell's background jobs
