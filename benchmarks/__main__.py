@@ -67,6 +67,8 @@ TABLES = (
           ("--baselines", "--steps", "0", "2", "--max_image_size", "640"), "640 pixels"),
     Table("quality-untuned", "quality", "quality.md",
           ("--sets", *UNTUNED, "--baselines", "interp", "patchmatch"), "scenes not tuned on"),
+    Table("quality-untuned-again", "quality", "quality.md",
+          ("--sets", *UNTUNED, "--baselines"), "scenes not tuned on, again"),
     Table("quality-colour", "quality", "quality.md",
           ("--sets", *UNTUNED, "--baselines", "--steps", "2", "--plane_colour", "0"),
           "colours of kept depths aside"),
