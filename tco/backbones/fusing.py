@@ -39,7 +39,6 @@ class Fusing:
             into: (..., C) where to make the result, without gradients; a new tensor by default.
         """
         self.layers, self.mixed, self.into = layers, mixed, into
-        self.looped = False
         self.total: Tensor | None = None
         self.weights: Tensor | None = None
 
@@ -66,7 +65,6 @@ class Fusing:
         """The same of numpy's arrays, in place."""
         from tco.backbones._fuse_kernels import Layers, fuse
 
-        self.looped = True
         first, last = self.layers[0], self.layers[-1]
         assert isinstance(first, nn.Linear) and isinstance(last, nn.Linear)
         groups, channels = correlations.shape[-1], last.out_features - 1
@@ -95,7 +93,7 @@ class Fusing:
         """
         if self.total is None or self.weights is None:
             raise ValueError("nothing was added that could be fused")
-        if self.looped:
-            return self.total.div_(self.weights.add_(NONE))
-        result = self.total / (self.weights + NONE)
-        return result if self.into is None else self.into.copy_(result)
+        if self.total.requires_grad:
+            return self.total / (self.weights + NONE)
+        result = self.total.div_(self.weights.add_(NONE))
+        return result if self.into is None or self.into is result else self.into.copy_(result)
