@@ -193,9 +193,9 @@ def _file_cache(stat: Path) -> int:
 def cycles_left() -> Iterator[None]:
     """Search for no cycles of garbage inside the block, but where that is asked for.
 
-    As between chunks, and by :func:`release`. Python looks for them whenever many objects have been made, as by every import, and then at all that
-    there are: of torch's and numba's modules that takes half a second of a run that takes twenty. Nothing
-    large is in a cycle here, which a test holds true.
+    That is between chunks, and by :func:`release`. Python looks for them whenever many objects have been
+    made, as by every import, and then at all that there are: of torch's and numba's modules that takes half a
+    second of a run that takes twenty. Nothing large is in a cycle here, which a test holds true.
     """
     searching = gc.isenabled()
     gc.disable()
