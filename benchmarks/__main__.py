@@ -79,6 +79,7 @@ TABLES = (
           ("--baselines", "--steps", "1", "5", "10", "20", "40"), "more steps"),
     Table("quality-seed", "quality", "quality.md",
           ("--baselines", "--steps", "2", "--seed", "1"), "another seed"),
+    Table("alike", "alike", "alike.md"),
     Table("claim", "claim", "claim.md", _THREE),
     Table("claim-hills", "claim", "claim.md", (*_TWO, "--sets", "hills", "knots"), "hills and knots"),
     Table("claim-walk", "claim", "claim.md", (*_TWO, "--sets", "walk", "temple"), "walk and temple"),

@@ -12,6 +12,7 @@ They are input alone: no penalty holds depths to them, since they are the networ
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -157,7 +158,8 @@ def agreed_points(
         views: whose valid pixels count.
         given: points of each view; pixels nearer to one than ``hint_distance`` do not count.
         config: settings.
-        seed: of the pixels that are drawn of those that count, at most ``hint_points`` a view.
+        seed: of the pixels that are drawn of those that count, at most ``hint_points`` a view, spread over
+            the picture (:func:`spread`).
 
     Returns:
         By view; views without any are not in it.
@@ -173,13 +175,37 @@ def agreed_points(
         counts = valid[i] & (depths[i] > 0) & depths[i].isfinite()
         counts &= (error[i] < c.hint_error) & (confidence[i] >= c.hint_confidence)
         counts &= _far(given[i].xy, views.size, c.hint_distance * max(views.size))
-        pixels = counts.flatten().nonzero().squeeze(1)
-        pixels = pixels[torch.randperm(len(pixels), generator=generator)[: c.hint_points]]
+        pixels = spread(counts, c.hint_points, torch.rand(counts.shape, generator=generator))
         if len(pixels):
             xy = torch.stack([pixels % width, pixels // width], 1) + 0.5
             depth, sigma = depths[i].flatten()[pixels], error[i].flatten()[pixels].clamp_min(LEAST)
             found[i] = SparseDepth(xy, depth, sigma, torch.full_like(pixels, UNTRACKED))
     return found
+
+
+def spread(counts: Tensor, most: int, turn: Tensor) -> Tensor:
+    """Pixels of a mask spread evenly: one of each square of the picture, then a second one, and so on.
+
+    A pixel that counts no more is replaced by one other, and nothing else changes, so that results that
+    differ in last bits stay near each other.
+
+    Args:
+        counts: (H, W) which pixels may be taken.
+        most: how many are, at most; the picture has as many squares.
+        turn: (H, W) numbers in [0, 1): in each square that with the least comes first.
+
+    Returns:
+        (N,) flat indices.
+    """
+    (height, width), flat = counts.shape, counts.flatten().nonzero().squeeze(1).numpy()
+    side = max(1.0, math.sqrt(height * width / most))
+    square = (flat // width // side) * math.ceil(width / side) + flat % width // side
+    lot = turn.flatten().numpy()[flat]
+    order = np.lexsort((lot, square))
+    begins = np.flatnonzero(np.diff(square[order], prepend=-1))
+    rank = np.arange(len(flat)) - np.repeat(begins, np.diff(begins, append=len(flat)))
+    first = np.lexsort((lot[order], rank))[:most]
+    return torch.from_numpy(flat[order[first]])
 
 
 def _far(xy: Tensor, size: tuple[int, int], distance: float) -> Tensor:

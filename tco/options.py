@@ -197,7 +197,7 @@ class HintsConfig:
         "times that a network that takes points is asked again, with further ones where the views agreed on "
         "what it said before, in groups of eight views or more; 0: it is given COLMAP's points alone",
     )
-    hint_points: int = knob(600, "further points of a view, at most")
+    hint_points: int = knob(600, "further points of a view, at most, spread over the picture")
     hint_error: float = knob(
         0.01,
         "largest relative standard error of an agreed depth, or of the plane it is on, that becomes a point",

@@ -25,6 +25,8 @@ that judge them."""
 GRAZING = 0.5
 """Least cosine, but for the length of the ray, between a ray and a normal that is reckoned with: depths err
 more where a surface is seen at a flat angle, about by as much as less of it is across the surface."""
+GOLDEN, SHUFFLE = (5**0.5 - 1) / 2, 10_007.0
+"""What lots are turned by from one plane to the next, and multiplied by to draw judges."""
 FEWEST = 50
 """Pixels that make a plane."""
 STEPS = 5
@@ -37,7 +39,10 @@ ALIKE = 1.2e-3
 
 @dataclass(frozen=True)
 class _Pixels:
-    """N pixels of any views: points, normals, directions of rays (N, 3), depths, errors, weights (N,)."""
+    """N pixels of any views: points, normals, directions of rays (N, 3), depths, errors, weights (N,).
+
+    Of each there is a number in [0, 1) that draws it, (N,), whichever the others are.
+    """
 
     points: Floats
     normals: Floats
@@ -45,18 +50,20 @@ class _Pixels:
     depth: Floats
     error: Floats
     weight: Floats
+    lot: Floats
 
     def __getitem__(self, keep: Bools | Labels) -> _Pixels:
         return _Pixels(
             self.points[keep], self.normals[keep], self.directions[keep], self.depth[keep],
-            self.error[keep], self.weight[keep],
+            self.error[keep], self.weight[keep], self.lot[keep],
         )  # fmt: skip
 
     @staticmethod
-    def of(view: Shown, on: Labels, normals: Floats) -> _Pixels:
+    def of(view: Shown, on: Labels, normals: Floats, lot: Floats | None = None) -> _Pixels:
         """Some of a view's pixels, by flat indices, whose normals are given."""
-        part = view.at(on)
-        return _Pixels(part.points, normals, part.directions, part.depth, part.error, part.sure.clip(0, SURE))
+        part, lot = view.at(on), np.zeros(len(on)) if lot is None else lot
+        sure = part.sure.clip(0, SURE)
+        return _Pixels(part.points, normals, part.directions, part.depth, part.error, sure, lot)
 
     @staticmethod
     def joined(parts: Sequence[_Pixels]) -> _Pixels:
@@ -100,7 +107,7 @@ def find(
     pixels = _drawn(views, count, rng)
     total, found = float(pixels.weight.sum()), list[Plane]()
     while len(found) < config.planes and len(pixels.depth) >= FEWEST and total > 0:
-        best = _best(pixels, rng)
+        best = _best(pixels, len(found))
         normal, offset, on = _robust(pixels, *best)
         if on.sum() < FEWEST or pixels.weight[on].sum() < config.plane_share * total:
             break
@@ -110,24 +117,36 @@ def find(
 
 
 def _drawn(views: Iterable[Shown], count: int, rng: np.random.Generator) -> _Pixels:
-    """Pixels that have a normal, at random from all ``count`` views, which are read one by one."""
+    """Pixels that have a normal, at random from all ``count`` views, which are read one by one.
+
+    That one pixel more has a normal changes one that is drawn, and none of another view.
+    """
     parts = []
     for view in views:
-        n = normals(view)
+        n, (turn, lot) = normals(view), rng.random((2, view.depth.size))
         there = np.flatnonzero((n != 0).any(-1) & (view.sure > 0))
-        pick = rng.permutation(there)[: -(-SAMPLES // count)]
-        parts.append(_Pixels.of(view, pick, n.reshape(-1, 3)[pick]))
+        pick = there[turn[there].argsort()[: -(-SAMPLES // count)]]
+        parts.append(_Pixels.of(view, pick, n.reshape(-1, 3)[pick], lot[pick]))
     return _Pixels.joined(parts)
 
 
-def _best(pixels: _Pixels, rng: np.random.Generator) -> tuple[Floats, float]:
+def _best(pixels: _Pixels, turn: int) -> tuple[Floats, float]:
     """Normal and offset of the best of some planes through a pixel each."""
-    chance = pixels.weight.astype(np.float64)
-    drawn = pixels[rng.choice(len(chance), DRAWN, p=chance / chance.sum())]
-    judges = pixels[rng.permutation(len(chance))[:JUDGES]]
+    drawn, judges = _chosen(pixels, turn)
     offsets = (drawn.points * drawn.normals).sum(-1)
     first = int(votes_for(judges, drawn.normals, offsets).argmax())
     return drawn.normals[first], float(offsets[first])
+
+
+def _chosen(pixels: _Pixels, turn: int) -> tuple[_Pixels, _Pixels]:
+    """Pixels that planes are put through, by weight, and pixels that judge these; others at every turn.
+
+    What a pixel's lot is does not depend on the others. Those are drawn of whose lot the logarithm is least
+    for their weight (Efraimidis and Spirakis, "Weighted random sampling with a reservoir", 2006).
+    """
+    lot = (pixels.lot + turn * GOLDEN) % 1
+    keys = -np.log(1 - lot) / pixels.weight.astype(np.float64).clip(1e-12)
+    return pixels[keys.argsort()[:DRAWN]], pixels[(lot * SHUFFLE % 1).argsort()[:JUDGES]]
 
 
 def votes_for(pixels: _Pixels, normals: Floats, offsets: Floats) -> Floats:

@@ -22,6 +22,7 @@ from tco.hints import (
     further_points,
     joined,
     reduced,
+    spread,
     told,
     with_more,
 )
@@ -164,6 +165,36 @@ def test_the_seed_draws_them(scene: Wall) -> None:
         return agreed_points(agreement(scene), scene.views, given(scene), PLAIN, seed)[2].xy
 
     assert torch.equal(drawn(3), drawn(3)) and not torch.equal(drawn(3), drawn(4))
+
+
+def test_points_are_spread_over_the_picture(scene: Wall) -> None:
+    """One of each of 6 × 8 squares of 8 pixels; two of each if only half of the squares may be taken."""
+    for columns, times in ((64, 1), (32, 2)):
+        counts, turn = torch.zeros(48, 64, dtype=torch.bool), torch.rand(48, 64)
+        counts[:, :columns] = True
+        taken = torch.zeros(48 * 64).scatter_(0, spread(counts, 48, turn), 1.0).reshape(6, 8, 8, 8)
+        assert (taken.sum((1, 3))[:, : columns // 8] == times).all() and int(taken.sum()) == 48
+        least = turn.reshape(6, 8, 8, 8).amin((1, 3))[:, : columns // 8]
+        assert (turn[taken.reshape(48, 64) > 0][:, None] == least.flatten()).any(0).all()
+    assert len(spread(counts, 10_000, turn)) == 48 * 32 and len(spread(counts & False, 5, turn)) == 0
+    odd = spread(torch.ones(7, 5, dtype=torch.bool), 3, torch.rand(7, 5))
+    assert len(set(odd.tolist())) == 3 and int(odd.min()) >= 0 and int(odd.max()) < 35
+
+
+def test_a_pixel_fewer_changes_one_point(scene: Wall) -> None:
+    """Whichever others count, a pixel has its turn; so last bits, too, change little of what is told."""
+
+    def drawn(valid: Tensor) -> list[set[tuple[float, ...]]]:
+        found = agreed_points(agreement(scene), replace(scene.views, valid=valid), given(scene), PLAIN)
+        return [set(map(tuple, points.xy.tolist())) for points in found.values()]
+
+    valid = scene.views.valid.clone()
+    before = drawn(valid)
+    x, y = next(iter(before[1]))
+    valid[1, int(y), int(x)] = False
+    after = drawn(valid)
+    assert before[1] - after[1] == {(x, y)} and len(after[1] - before[1]) == 1
+    assert [before[i] for i in (0, 2, 3)] == [after[i] for i in (0, 2, 3)]
 
 
 def test_views_that_help_are_not_told(scene: Wall) -> None:

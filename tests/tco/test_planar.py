@@ -16,7 +16,7 @@ from tco.consensus import Agreement, agreed
 from tco.options import ConsensusConfig
 from tco.planar import run
 from tco.planar._kernels import least_labels
-from tco.planar.fit import ALIKE, LEAST, _Pixels, find, refit, votes_for
+from tco.planar.fit import ALIKE, DRAWN, LEAST, _chosen, _drawn, _Pixels, find, refit, votes_for
 from tco.planar.label import ACROSS, BINS, MOST_UNLIKE, borders, labelled, rarity
 from tco.planar.run import flattened, together
 from tco.planar.view import ERROR, SIDE, Floats, Labels, Plane, Shown, normals, shown
@@ -152,6 +152,40 @@ def test_pixels_vote_for_the_planes_that_they_are_on(scene: Wall) -> None:
     for normal, offset, votes in zip(planes.normals, offsets, found, strict=True):
         assert votes == pytest.approx(float(pixels.weight @ pixels.near(normal, offset)), rel=2e-3)
     assert found.min() < 0.5 * found.max()
+
+
+def test_a_pixel_more_or_less_changes_one_that_is_drawn(scene: Wall) -> None:
+    """And so nothing else depends on it: what is drawn of all other views stays as it was."""
+
+    def places(views: list[Shown]) -> set[tuple[float, ...]]:
+        drawn = _drawn(views, 40, np.random.default_rng(0))
+        assert len(drawn.depth) == 6 * 750
+        return set(map(tuple, np.column_stack([drawn.points, drawn.lot])))
+
+    views, full = seen(scene, noisy(scene, 0.02)), places(seen(scene, noisy(scene, 0.02)))
+    sure = views[2].sure.copy()
+    points = views[2].points.reshape(-1, 3)
+    gone = next(i for i in range(2000, len(points)) if tuple(points[i]) in {row[:3] for row in full})
+    sure.flat[gone] = 0
+    other = places([*views[:2], replace(views[2], sure=sure), *views[3:]])
+    assert len(full - other) == len(other - full) == 1
+    assert next(iter(full - other))[:3] == tuple(points[gone])
+
+
+def test_planes_are_drawn_by_weight_and_judges_without(scene: Wall) -> None:
+    """Three times the weight is three times the chance; at every turn others are drawn."""
+    view = seen(scene, scene.depth)[0]
+    pick, lots = np.arange(view.depth.size), np.random.default_rng(1).random(view.depth.size)
+    pixels = _Pixels.of(view, pick, np.broadcast_to(NORMAL, (len(pick), 3)), lots)
+    heavy = np.random.default_rng(2).random(len(pick)) < 0.5
+    pixels = replace(pixels, weight=np.where(heavy, 3.0, 1.0), error=heavy.astype(float))
+    drawn, judges = zip(*(_chosen(pixels, turn) for turn in range(32)), strict=True)
+    share = np.mean([part.error.mean() for part in drawn])
+    assert share == pytest.approx(0.75 * heavy.mean() / (0.25 + 0.5 * heavy.mean()), abs=0.015)
+    assert np.mean([part.error.mean() for part in judges]) == pytest.approx(heavy.mean(), abs=0.01)
+    assert all(len(part.lot) == DRAWN for part in drawn)
+    once = len(np.unique(np.concatenate([part.lot for part in drawn])))
+    assert once > 0.6 * min(32 * DRAWN, len(pick))
 
 
 def test_the_wall_is_found_among_outliers(scene: Wall) -> None:
