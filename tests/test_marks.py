@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
-from benchmarks.marks import FIFTHS, at_points, compared, lines
+from benchmarks.marks import FIFTHS, at_points, compared, lines, looked_up, wrong
 from benchmarks.real import RealSet
 from colmap_tco.priors import PriorSet
+from tco.toy import wall
 from tco.types import Priors, SparseDepth, Views
 
 H, W = 10, 20
@@ -58,3 +61,41 @@ def test_spread_as_pixels_counts_each_range_alike(scene: RealSet) -> None:
     assert float(first[4]) == 0.5
     assert float(first[5]) == pytest.approx(2 / 3, abs=1e-3)  # of the ranges that have points
     assert float(first[6]) == 1.0
+
+
+@pytest.fixture(scope="module")
+def textured() -> RealSet:
+    """Four views of a slanted, textured wall."""
+    made = wall(4, (48, 64), 0.3)
+    return RealSet("wall", made.views, PriorSet(made.priors, (), {}), made.depth)
+
+
+def test_true_depths_find_the_same_place_in_other_views(textured: RealSet) -> None:
+    for other in (1, 2, 3):
+        found, z = looked_up(textured, textured.truth[0], 0, other)
+        seen = z > 0
+        assert float(seen.float().mean()) > 0.5
+        off = (found[:3] - textured.views.images[0]).abs().mean(0)[seen]
+        assert float(off.mean()) < 0.25 * float(textured.views.images[0].std())
+        assert float((found[3] / z - 1).abs()[seen].max()) < 0.02
+
+
+def test_colours_tell_which_depths_are_wrong(textured: RealSet) -> None:
+    """A third of each view is a fifth too near; colours there fit the truth, or both if there are none."""
+    depth = textured.truth.clone()
+    depth[:, 16:32] *= 0.8
+    found = wrong(textured, depth)
+    assert found.share == pytest.approx(1 / 3) and 0 < found.seen <= 4 * 16 * 64
+    assert found.true < 0.6 * found.ours and found.better < 0.3
+    plain = replace(textured.views, images=torch.full_like(textured.views.images, 0.5))
+    found = wrong(replace(textured, views=plain), depth)
+    assert max(found.ours, found.true) < 1e-6 and found.better == 0
+
+
+def test_what_no_other_view_sees_is_not_asked(textured: RealSet) -> None:
+    """In truth something else is at that place in all other views, so that it is hidden there."""
+    depth, truth = textured.truth.clone(), textured.truth.clone()
+    depth[0, :8] *= 0.5
+    truth[1:] *= 0.5
+    found = wrong(replace(textured, truth=truth), torch.cat([depth[:1], truth[1:]]))
+    assert found.seen == 0 and found.share == pytest.approx(8 / 48 / 4)
