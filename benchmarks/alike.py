@@ -37,7 +37,8 @@ OTHERS = (
 """What the runs are that are compared with the first: name, environment, options."""
 LEGEND = (
     "med: median relative difference of depths from the first run's. apart: share of the pixels that have a "
-    "depth in both which are more than 2 % apart. d2, d5, f5: scores as in `docs/quality.md`."
+    "depth in both which are more than 2 % apart. d2, d5, f5: scores as in `docs/quality.md`. "
+    "On a processor without AMX or AVX-512 the rows that leave these out are the first run again."
 )
 
 
@@ -70,9 +71,9 @@ def made(name: str, work: Path, environment: Mapping[str, str], options: tuple[s
     return copy / "dense-tco"
 
 
-def row(name: str, what: str, root: Path, first: NDArray[np.float32] | None, work: Path) -> str:
+def row(name: str, what: str, root: Path, first: NDArray[np.float32], work: Path) -> str:
     """A line of the table."""
-    median, apart = difference(depths(root) if first is None else first, depths(root))
+    median, apart = difference(first, depths(root))
     figures = scored(workspace(name, work.parent), "--dense", str(root))[0]
     scores = " | ".join(f"{figures[key]:.3f}" for key in ("d2", "d5", "f5"))
     return f"| {name} | {what} | {100 * median:.3f} % | {100 * apart:.2f} % | {scores} |\n"
@@ -90,17 +91,17 @@ def parser() -> argparse.ArgumentParser:
 def main() -> None:
     """Measure and publish, row by row."""
     args, rest = parser().parse_known_args()
+    if "ONEDNN_MAX_CPU_ISA" in os.environ:
+        sys.exit("ONEDNN_MAX_CPU_ISA is set, so that the first run would not be the usual one: unset it")
     args.work.mkdir(parents=True, exist_ok=True)
     told = " ".join(["--sets", *args.sets, *rest])
     about = f"`python -m benchmarks.alike {told}`: {weights_told(located(NETWORKS['sweep']))}. {LEGEND}"
     text = f"# How alike runs are, measured\n\n{paragraph(about)}\n"
     text += "| set | run | med | apart | d2 | d5 | f5 |\n" + "|---" * 7 + "|\n"
-    if "ONEDNN_MAX_CPU_ISA" in os.environ:
-        sys.exit("ONEDNN_MAX_CPU_ISA is set, so that the first run would not be the usual one: unset it")
     for name in args.sets:
         root = made(name, args.work, {}, tuple(rest))
         first = depths(root)
-        text += row(name, "first", root, None, args.work)
+        text += row(name, "first", root, first, args.work)
         for what, environment, options in OTHERS:
             root = made(name, args.work, environment, (*rest, *options))
             text += row(name, what, root, first, args.work)

@@ -103,14 +103,15 @@ def looked_up(real: RealSet, depth: Tensor, view: int, other: int) -> tuple[Tens
 
     Returns:
         (4, H, W) its colours and its true depth, the latter of one pixel; (H, W) depth of the points there, 0
-        where they are not in its picture.
+        where they are not in its picture, or there is no depth.
     """
     assert real.given.cameras is not None
     cameras = real.given.cameras
     size, points = depth.shape, unproject(depth, cameras.K[view]).reshape(-1, 3)
     other_from_view = invert(cameras.world_from_cam[other]) @ cameras.world_from_cam[view]
     xy, z = project(transform(other_from_view, points), cameras.K[other])
-    inside = (xy >= 0.5).all(-1) & (xy <= xy.new_tensor([size[1], size[0]]) - 0.5).all(-1) & (z > 0)
+    inside = (xy >= 0.5).all(-1) & (xy <= xy.new_tensor([size[1], size[0]]) - 0.5).all(-1)
+    inside &= (z > 0) & (depth.flatten() > 0)
     colours = sample(real.views.images[other][None], xy[None])[0]
     there = sample(real.truth[other][None, None], xy[None], mode="nearest")[0]
     return torch.cat([colours, there]).unflatten(-1, size), (z * inside).unflatten(-1, size)
@@ -190,7 +191,7 @@ def main() -> None:
         "that is too near by more than 5 %."
     )
     asked = (
-        f"The pixels that are off by more than 5 %, or have no depth, and what the {ASKED} views that "
+        f"The pixels that are off by more than 5 % or have no depth, and what the {ASKED} views that "
         "overlap best show where the maps put them and where they are; of pixels whose true place one of "
         "these sees (its own true depth is the same). Colours: mean difference, of 1. ours fits better: "
         "share of these pixels whose colours differ less at the wrong depth than at the true one."

@@ -99,3 +99,11 @@ def test_what_no_other_view_sees_is_not_asked(textured: RealSet) -> None:
     truth[1:] *= 0.5
     found = wrong(replace(textured, truth=truth), torch.cat([depth[:1], truth[1:]]))
     assert found.seen == 0 and found.share == pytest.approx(8 / 48 / 4)
+
+
+def test_pixels_without_a_depth_are_off_and_have_no_colours(textured: RealSet) -> None:
+    depth = textured.truth.clone()
+    depth[:, :12] = 0.0
+    found = wrong(textured, depth)
+    assert found.share == pytest.approx(1 / 4) and found.seen == 0
+    assert not looked_up(textured, depth[0], 0, 1)[1][:12].any()
