@@ -39,10 +39,7 @@ ALIKE = 1.2e-3
 
 @dataclass(frozen=True)
 class _Pixels:
-    """N pixels of any views: points, normals, directions of rays (N, 3), depths, errors, weights (N,).
-
-    Of each there is a number in [0, 1) that draws it, (N,), whichever the others are.
-    """
+    """N pixels of any views: points, normals, directions of rays (N, 3), depths, errors, weights (N,)."""
 
     points: Floats
     normals: Floats
@@ -50,20 +47,18 @@ class _Pixels:
     depth: Floats
     error: Floats
     weight: Floats
-    lot: Floats
 
     def __getitem__(self, keep: Bools | Labels) -> _Pixels:
         return _Pixels(
             self.points[keep], self.normals[keep], self.directions[keep], self.depth[keep],
-            self.error[keep], self.weight[keep], self.lot[keep],
+            self.error[keep], self.weight[keep],
         )  # fmt: skip
 
     @staticmethod
-    def of(view: Shown, on: Labels, normals: Floats, lot: Floats | None = None) -> _Pixels:
+    def of(view: Shown, on: Labels, normals: Floats) -> _Pixels:
         """Some of a view's pixels, by flat indices, whose normals are given."""
-        part, lot = view.at(on), np.zeros(len(on)) if lot is None else lot
-        sure = part.sure.clip(0, SURE)
-        return _Pixels(part.points, normals, part.directions, part.depth, part.error, sure, lot)
+        part = view.at(on)
+        return _Pixels(part.points, normals, part.directions, part.depth, part.error, part.sure.clip(0, SURE))
 
     @staticmethod
     def joined(parts: Sequence[_Pixels]) -> _Pixels:
@@ -104,49 +99,51 @@ def find(
         config: how many planes at most, and how much each must explain.
         rng: draws them.
     """
-    pixels = _drawn(views, count, rng)
+    pixels, lots = _drawn(views, count, rng)
     total, found = float(pixels.weight.sum()), list[Plane]()
     while len(found) < config.planes and len(pixels.depth) >= FEWEST and total > 0:
-        best = _best(pixels, len(found))
+        best = _best(*_chosen(pixels, lots, len(found)))
         normal, offset, on = _robust(pixels, *best)
         if on.sum() < FEWEST or pixels.weight[on].sum() < config.plane_share * total:
             break
         found.append(_plane(pixels[on], normal, offset))
-        pixels = pixels[~pixels.near(normal, offset, 1.5)]
+        left = ~pixels.near(normal, offset, 1.5)
+        pixels, lots = pixels[left], lots[left]
     return found
 
 
-def _drawn(views: Iterable[Shown], count: int, rng: np.random.Generator) -> _Pixels:
-    """Pixels that have a normal, at random from all ``count`` views, which are read one by one.
+def _drawn(views: Iterable[Shown], count: int, rng: np.random.Generator) -> tuple[_Pixels, Floats]:
+    """Pixels that have a normal, at random from all ``count`` views, which are read one by one; their lots.
 
-    That one pixel more has a normal changes one that is drawn, and none of another view.
+    Lots (N,), in [0, 1), are what draws pixels later (:func:`_chosen`). That one pixel more has a normal
+    changes one that is drawn, and none of another view.
     """
-    parts = []
+    parts, lots = [], []
     for view in views:
         n, (turn, lot) = normals(view), rng.random((2, view.depth.size))
         there = np.flatnonzero((n != 0).any(-1) & (view.sure > 0))
         pick = there[turn[there].argsort()[: -(-SAMPLES // count)]]
-        parts.append(_Pixels.of(view, pick, n.reshape(-1, 3)[pick], lot[pick]))
-    return _Pixels.joined(parts)
+        parts.append(_Pixels.of(view, pick, n.reshape(-1, 3)[pick]))
+        lots.append(lot[pick])
+    return _Pixels.joined(parts), np.concatenate(lots)
 
 
-def _best(pixels: _Pixels, turn: int) -> tuple[Floats, float]:
-    """Normal and offset of the best of some planes through a pixel each."""
-    drawn, judges = _chosen(pixels, turn)
+def _best(drawn: _Pixels, judges: _Pixels) -> tuple[Floats, float]:
+    """Normal and offset of the best, in the eyes of some pixels, of the planes through others."""
     offsets = (drawn.points * drawn.normals).sum(-1)
     first = int(votes_for(judges, drawn.normals, offsets).argmax())
     return drawn.normals[first], float(offsets[first])
 
 
-def _chosen(pixels: _Pixels, turn: int) -> tuple[_Pixels, _Pixels]:
+def _chosen(pixels: _Pixels, lots: Floats, turn: int) -> tuple[_Pixels, _Pixels]:
     """Pixels that planes are put through, by weight, and pixels that judge these; others at every turn.
 
     What a pixel's lot is does not depend on the others. Those are drawn of whose lot the logarithm is least
     for their weight (Efraimidis and Spirakis, "Weighted random sampling with a reservoir", 2006).
     """
-    lot = (pixels.lot + turn * GOLDEN) % 1
-    keys = -np.log(1 - lot) / pixels.weight.astype(np.float64).clip(1e-12)
-    return pixels[keys.argsort()[:DRAWN]], pixels[(lot * SHUFFLE % 1).argsort()[:JUDGES]]
+    lots = (lots + turn * GOLDEN) % 1
+    keys = -np.log(1 - lots) / pixels.weight.astype(np.float64).clip(1e-12)
+    return pixels[keys.argsort()[:DRAWN]], pixels[(lots * SHUFFLE % 1).argsort()[:JUDGES]]
 
 
 def votes_for(pixels: _Pixels, normals: Floats, offsets: Floats) -> Floats:

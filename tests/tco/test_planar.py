@@ -158,9 +158,9 @@ def test_a_pixel_more_or_less_changes_one_that_is_drawn(scene: Wall) -> None:
     """And so nothing else depends on it: what is drawn of all other views stays as it was."""
 
     def places(views: list[Shown]) -> set[tuple[float, ...]]:
-        drawn = _drawn(views, 40, np.random.default_rng(0))
+        drawn, lots = _drawn(views, 40, np.random.default_rng(0))
         assert len(drawn.depth) == 6 * 750
-        return set(map(tuple, np.column_stack([drawn.points, drawn.lot])))
+        return set(map(tuple, np.column_stack([drawn.points, lots])))
 
     views, full = seen(scene, noisy(scene, 0.02)), places(seen(scene, noisy(scene, 0.02)))
     sure = views[2].sure.copy()
@@ -176,15 +176,15 @@ def test_planes_are_drawn_by_weight_and_judges_without(scene: Wall) -> None:
     """Three times the weight is three times the chance; at every turn others are drawn."""
     view = seen(scene, scene.depth)[0]
     pick, lots = np.arange(view.depth.size), np.random.default_rng(1).random(view.depth.size)
-    pixels = _Pixels.of(view, pick, np.broadcast_to(NORMAL, (len(pick), 3)), lots)
+    pixels = _Pixels.of(view, pick, np.broadcast_to(NORMAL, (len(pick), 3)))
     heavy = np.random.default_rng(2).random(len(pick)) < 0.5
     pixels = replace(pixels, weight=np.where(heavy, 3.0, 1.0), error=heavy.astype(float))
-    drawn, judges = zip(*(_chosen(pixels, turn) for turn in range(32)), strict=True)
+    drawn, judges = zip(*(_chosen(pixels, lots, turn) for turn in range(32)), strict=True)
     share = np.mean([part.error.mean() for part in drawn])
     assert share == pytest.approx(0.75 * heavy.mean() / (0.25 + 0.5 * heavy.mean()), abs=0.015)
     assert np.mean([part.error.mean() for part in judges]) == pytest.approx(heavy.mean(), abs=0.01)
-    assert all(len(part.lot) == DRAWN for part in drawn)
-    once = len(np.unique(np.concatenate([part.lot for part in drawn])))
+    assert all(len(part.depth) == DRAWN for part in drawn)
+    once = len(np.unique(np.concatenate([part.points for part in drawn]), axis=0))
     assert once > 0.6 * min(32 * DRAWN, len(pick))
 
 
