@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from tco.backbones.base import Backbone
+    from tco.conclusion import Conclusion
     from tco.optimize import Outcome
-    from tco.planar.run import OnPlanes
     from tco.types import Cameras, Prediction
 
 log = logging.getLogger(__name__)
@@ -114,8 +114,8 @@ def predict_chunk(
         watched=[points.to(device) for points in priors.held_out],
     )
     assert priors.optimise.sparse is not None
-    flat = concluded(outcome, there, priors.optimise, tco_config, seed)
-    prediction, error = flat.agreement.prediction, flat.agreement.error
+    end = concluded(outcome, there, priors.optimise, tco_config, seed)
+    prediction, error = end.agreement.prediction, end.agreement.error
     own, moved = outcome.prediction.to("cpu"), outcome.cameras.to("cpu")
     used, held = (errors_at_points(prediction, p) for p in (priors.optimise.sparse, priors.held_out))
     results = {}
@@ -135,7 +135,7 @@ def predict_chunk(
         }
         maps = view_maps(view, prediction, i, images.valid, frame.scale, error, num_threads)
         before = view_maps(view, own, i, images.valid, frame.scale, num_threads=num_threads)
-        figures |= _asked(own.depth[i], flat, i, images.valid[i], outcome)
+        figures |= _asked(own.depth[i], end, i, images.valid[i], outcome)
         corrected = corrected_view(view, frame.scale, cameras, moved, i)
         results[view.name] = ViewResult(maps, before, figures, corrected)
     if aligned is not None:
@@ -147,16 +147,18 @@ def predict_chunk(
     return ChunkResult(results, outcome.history, {})
 
 
-def _asked(own: Tensor, flat: OnPlanes, i: int, valid: Tensor, outcome: Outcome) -> dict[str, object]:
-    """What others said of view ``i``: further points, by how much its depths moved, what is on planes."""
-    after, spread = flat.before.prediction.depth[i], flat.before.error[i]
+def _asked(own: Tensor, end: Conclusion, i: int, valid: Tensor, outcome: Outcome) -> dict[str, object]:
+    """What others said of view ``i``: further points, how far depths moved, what is on planes or taken."""
+    before, taken = end.flat.before, end.taken[i]
+    after, spread = before.prediction.depth[i], before.error[i]
     known = valid & (own > 0) & (after > 0)
     moved = (after[known] / own[known]).log().abs()
     return {
         "points_agreed": len(outcome.told[i]) if i in outcome.told else 0,
         "moved_by_consensus": _median(moved),
         "asked_by_consensus": float(spread.isfinite()[valid].float().mean()),
-        "on_planes": float((flat.labels[i] > 0)[valid].float().mean()),
+        "on_planes": float(((end.flat.labels[i] > 0) & ~taken)[valid].float().mean()),
+        "taken_from_others": float(taken[valid].float().mean()),
     }
 
 

@@ -1,4 +1,4 @@
-"""What comes of an optimisation: refined depths where the views agree on them, the consensus, and planes.
+"""What comes of an optimisation: refined depths where the views agree on them, consensus, planes, contest.
 
 Refinement (:mod:`tco.polish`) brings depths nearer to the truth where the pictures have texture, and moves
 them at random where they have none: there colours say nothing and any step is as good. What it did is told by
@@ -9,12 +9,14 @@ without colours objecting is a reason to doubt them.
 
 Each view's own depths stay refined everywhere: fusion takes what several find alike, and depths that were
 moved at random are not among that.
+
+In the end depths that others contradict are replaced (:mod:`tco.contest`).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -22,6 +24,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from tco.consensus import Agreement, agreed
+from tco.contest import settled
 from tco.options import TCOConfig
 from tco.planar.run import OnPlanes, on_planes
 from tco.planar.view import SIDE
@@ -36,7 +39,23 @@ LEAST, MOST = 1e-4, 0.5
 """Bounds of a standard error there; where too few views spoke it is the larger one."""
 
 
-def concluded(outcome: Outcome, views: Views, priors: Priors, config: TCOConfig, seed: int = 0) -> OnPlanes:
+@dataclass(frozen=True)
+class Conclusion:
+    """What the views say in the end, on the CPU.
+
+    Attributes:
+        agreement: their depths, and standard errors of these. Where a depth is another view's, the error is
+            what the two differ by, as a logarithm of their ratio, if that is larger.
+        flat: the same before depths were contested.
+        taken: (V, H, W) where a depth is another view's.
+    """
+
+    agreement: Agreement
+    flat: OnPlanes
+    taken: Tensor
+
+
+def concluded(outcome: Outcome, views: Views, priors: Priors, config: TCOConfig, seed: int = 0) -> Conclusion:
     """What the views say together, with refined depths or those of before, on planes where it is flat.
 
     Args:
@@ -51,14 +70,23 @@ def concluded(outcome: Outcome, views: Views, priors: Priors, config: TCOConfig,
     """
     prediction, cameras = outcome.prediction, outcome.cameras
     agreement = agreed(prediction, cameras, views, priors, config.consensus)
+    asked = agreement.prediction is not prediction
     growth = config.polish.polish_growth
-    if outcome.before is not None and growth > 0 and agreement.prediction is not prediction:
+    if outcome.before is not None and growth > 0 and asked:
         before = agreed(outcome.before, cameras, views, priors, config.consensus)
         keep = grown(before.error, agreement.error) <= growth
         depth = agreement.prediction.depth.where(keep, before.prediction.depth)
         error = agreement.error.where(keep, torch.maximum(agreement.error, before.error))
         agreement = Agreement(replace(agreement.prediction, depth=depth), error)
-    return on_planes(agreement, prediction, cameras, views, config.consensus, seed)
+    flat = on_planes(agreement, prediction, cameras, views, config.consensus, seed)
+    found = flat.agreement.prediction.depth
+    if not asked or priors.overlap is None:
+        return Conclusion(flat.agreement, flat, torch.zeros_like(found, dtype=torch.bool))
+    depth, taken = settled(found, cameras.to("cpu"), views.to("cpu"), priors.overlap, config.consensus)
+    error = flat.agreement.error
+    apart = (depth / found).log().abs().where(taken, torch.zeros_like(error))
+    told = Agreement(replace(flat.agreement.prediction, depth=depth), torch.maximum(error, apart))
+    return Conclusion(told, flat, taken)
 
 
 def grown(before: Tensor, after: Tensor) -> Tensor:

@@ -144,6 +144,11 @@ class ConsensusConfig:
         "views are not asked where the standard deviations of the cameras move pixels by more than this "
         "share of the longer side: what others see is then elsewhere",
     )
+    contest_views: int = knob(
+        8,
+        "views that overlap best, whose depths a pixel may take instead of its own, where they and the "
+        "pictures say so; 0: none",
+    )
     planes: int = knob(
         20,
         "planes at most of each group of views, onto which depths are moved where they are unsure or nearly "
@@ -180,8 +185,10 @@ class ConsensusConfig:
         if self.plane_trust <= 0:
             raise ValueError("plane_trust must be positive")
         check_range(self, "plane_smoothness plane_square plane_colour", 0)
-        if self.consensus_rounds < 0 or self.consensus_views < 1:
-            raise ValueError("consensus_rounds must not be negative, and consensus_views at least 1")
+        if self.consensus_rounds < 0 or self.consensus_views < 1 or self.contest_views < 0:
+            raise ValueError(
+                "consensus_rounds and contest_views must not be negative, and consensus_views at least 1"
+            )
         if not (self.consensus_reach > 0 and self.consensus_width > 0):
             raise ValueError("consensus_reach and consensus_width must be positive")
         if self.consensus_uncertainty < 0:

@@ -471,11 +471,13 @@ def test_maps_are_nearer_to_the_truth_after_the_views_were_asked(done: Done) -> 
         on_planes = done.result.report["views"][name]["on_planes"]
         assert told > 0
         assert 0 <= on_planes <= 1
-        if on_planes == 0:
+        taken = done.result.report["views"][name]["taken_from_others"]
+        assert 0 <= taken < 0.2
+        if on_planes == 0 and taken < 0.01:
             assert told == pytest.approx(float(np.median(np.abs(np.log(together / own)))), rel=0.01)
         asked = done.result.report["views"][name]["asked_by_consensus"]
         error = read_map(paths.error_map(name))
-        assert error.shape == own.shape and bool(((error == 0) | (error >= 1e-6)).all()) and error.max() < 0.5
+        assert error.shape == own.shape and bool(((error == 0) | (error >= 1e-6)).all()) and error.max() < 1
         known_error = error > 0
         agreed = read_view(paths, name, agreed=True)
         assert agreed.depth.tobytes() == together.tobytes() and agreed.error is not None

@@ -75,13 +75,13 @@ def test_harm_is_taken_back_and_good_is_kept(scene: Wall) -> None:
     old, bad = noise(scene, 0.02), noise(scene, 0.15, 1)
     before = scene.depth * old
     after = torch.where(torch.arange(128) < 64, scene.depth * (1 + 0.1 * (old - 1)), scene.depth * bad)
-    flat = concluded(outcome(scene, after, before), scene.views, scene.priors, CONFIG)
+    end = concluded(outcome(scene, after, before), scene.views, scene.priors, CONFIG)
     left, right = slice(0, 48), slice(80, 128)
     of_old, of_new = (
         together(said(scene, d), cameras(scene), scene.views, scene.priors, CONFIG.consensus).agreement
         for d in (before, after)
     )
-    found = flat.agreement
+    found = end.flat.agreement
     kept = found.prediction.depth == of_new.prediction.depth
     back = found.prediction.depth == of_old.prediction.depth
     assert float(kept[..., left].float().mean()) > 0.95 and float(back[..., right].float().mean()) > 0.95
@@ -91,31 +91,49 @@ def test_harm_is_taken_back_and_good_is_kept(scene: Wall) -> None:
     error = (found.prediction.depth / scene.depth - 1).abs()
     ruined = (of_new.prediction.depth / scene.depth - 1).abs()
     assert float(error[..., right].mean()) < 0.5 * float(ruined[..., right].mean())
-    assert torch.equal(flat.before.prediction.depth, found.prediction.depth)
+    assert torch.equal(end.flat.before.prediction.depth, found.prediction.depth)
 
 
 def test_without_a_bound_all_refined_depths_are_kept(scene: Wall) -> None:
     config = replace(CONFIG, polish=PolishConfig(polish_growth=0.0))
     after = scene.depth * noise(scene, 0.15)
-    flat = concluded(outcome(scene, after, scene.depth), scene.views, scene.priors, config)
+    end = concluded(outcome(scene, after, scene.depth), scene.views, scene.priors, config)
     expected = together(said(scene, after), cameras(scene), scene.views, scene.priors, config.consensus)
-    assert torch.equal(flat.agreement.prediction.depth, expected.agreement.prediction.depth)
+    assert torch.equal(end.flat.agreement.prediction.depth, expected.agreement.prediction.depth)
 
 
 @pytest.mark.parametrize("planes", [0, 20])
 def test_what_was_not_refined_is_the_consensus_of_what_it_is(scene: Wall, planes: int) -> None:
     config = replace(CONFIG, consensus=ConsensusConfig(planes=planes))
     depth = scene.depth * noise(scene, 0.03)
-    flat = concluded(outcome(scene, depth, None), scene.views, scene.priors, config, 4)
+    end = concluded(outcome(scene, depth, None), scene.views, scene.priors, config, 4)
     expected = together(said(scene, depth), cameras(scene), scene.views, scene.priors, config.consensus, 4)
-    assert len(flat.planes) == len(expected.planes)
-    assert torch.equal(flat.agreement.prediction.depth, expected.agreement.prediction.depth)
-    assert torch.equal(flat.agreement.error, expected.agreement.error)
+    assert len(end.flat.planes) == len(expected.planes)
+    assert torch.equal(end.flat.agreement.prediction.depth, expected.agreement.prediction.depth)
+    assert torch.equal(end.flat.agreement.error, expected.agreement.error)
 
 
 def test_where_nobody_is_asked_refined_depths_stay(scene: Wall) -> None:
     config = replace(CONFIG, consensus=ConsensusConfig(consensus_rounds=0))
     after = scene.depth * noise(scene, 0.15)
-    flat = concluded(outcome(scene, after, scene.depth), scene.views, scene.priors, config)
-    assert torch.equal(flat.agreement.prediction.depth, after)
-    assert flat.planes == () and bool(flat.agreement.error.isinf().all())
+    end = concluded(outcome(scene, after, scene.depth), scene.views, scene.priors, config)
+    assert torch.equal(end.flat.agreement.prediction.depth, after)
+    assert end.flat.planes == () and bool(end.flat.agreement.error.isinf().all())
+    assert torch.equal(end.agreement.prediction.depth, after) and not end.taken.any()
+
+
+def test_a_depth_that_is_another_views_is_as_unsure_as_the_two_differ() -> None:
+    """Five of eleven views are wrong alike, enough to tell how sure they are of it."""
+    scene = wall(11)
+    depth = scene.depth.clone()
+    depth[1::2] *= 1.3
+    end = concluded(outcome(scene, depth, None), scene.views, scene.priors, CONFIG)
+    before, after = end.flat.agreement, end.agreement
+    apart = (after.prediction.depth / before.prediction.depth).log().abs()
+    assert float(end.taken[1::2].float().mean()) > 0.5 > 10 * float(end.taken[::2].float().mean())
+    assert torch.equal(after.error[end.taken], torch.maximum(before.error, apart)[end.taken])
+    told = after.error[end.taken & before.error.isfinite()]
+    assert len(told) > 1000 and float(told.median()) == pytest.approx(math.log(1.3), abs=0.01)
+    assert torch.equal(after.error[~end.taken], before.error[~end.taken])
+    assert torch.equal(after.prediction.depth[~end.taken], before.prediction.depth[~end.taken])
+    assert torch.equal(after.prediction.confidence, before.prediction.confidence)
