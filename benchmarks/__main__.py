@@ -103,6 +103,7 @@ TABLES = (
     Table("tco_step", "tco_step", "tco_step.md", ("--threads", "1", "--cpu_time")),
     Table("consensus", "consensus", "consensus.md"),
     Table("planes", "planes", "planes.md"),
+    Table("contest", "contest", "contest.md"),
     Table("hints", "hints", "hints.md",
           ("--sets", "kitchen", "office", "livingroom", "--random", "8", "--size", "256")),
     Table("calibration", "calibration", "calibration.md"),

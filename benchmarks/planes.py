@@ -41,12 +41,13 @@ SHAPE = (192, 256)
 
 @dataclass(frozen=True)
 class Case:
-    """A set whose views were asked, and its true depths (V, H, W), 0 where unknown."""
+    """A set whose views were asked, how these overlap (V, V), and true depths (V, H, W), 0 where unknown."""
 
     name: str
     agreement: Agreement
     cameras: Cameras
     views: Views
+    overlap: Tensor
     truth: Tensor
 
 
@@ -84,7 +85,8 @@ def cases(args: argparse.Namespace) -> Iterator[Case]:
         outcome = optimize(network, views, priors, config)
         plain = replace(config, consensus=replace(config.consensus, planes=0))
         together = concluded(outcome, views, priors, plain).flat.before
-        return Case(name, together, outcome.cameras, views, truth)
+        assert priors.overlap is not None
+        return Case(name, together, outcome.cameras, views, priors.overlap, truth)
 
     for name in args.sets:
         real = load(name, args.size, args.views)

@@ -40,13 +40,15 @@ class Others(NamedTuple):
     """The views that are asked.
 
     Attributes:
-        depth: (S, H, W), 0 where there is none.
-        grey: (S, H, W) pictures, below 0 where they do not count.
+        depth: (V, H, W) of all views, 0 where there is none.
+        grey: (V, H, W) pictures of all views, below 0 where they do not count.
+        which: (S,) views that are asked.
         poses: (S, 3, 4) that take a homogeneous pixel of the view, times its depth, and 1, to one of theirs.
     """
 
     depth: Floats
     grey: Floats
+    which: NDArray[np.int64]
     poses: Floats
 
 
@@ -133,7 +135,7 @@ def _votes(view: View, others: Others, rules: Rules, at: tuple[int, int], d: Any
         u, v, z = _place(others.poses[s], x, y, d)
         if not (u >= ZERO and v >= ZERO and u < f32(w) and v < f32(h)):
             continue
-        there = others.depth[s, int(v), int(u)]
+        there = others.depth[others.which[s], int(v), int(u)]
         if there > ZERO and abs(there - z) < same * z:
             agree += ONE
         elif there > beyond * z:
@@ -195,7 +197,7 @@ def _correlation(
         if not weight > ZERO:
             continue
         u, v, _ = _place(pose, f32(at[1]) + rules.window[t, 0], f32(at[0]) + rules.window[t, 1], d)
-        there = f32(_look_up(others.grey[s], u, v))
+        there = f32(_look_up(others.grey[others.which[s]], u, v))
         if there < ZERO:
             continue
         here, there = window[t, 0], there - view.grey[at]

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tco.options import ConsensusConfig
+from tco.planar.run import WORKERS
 from tco.schedule import most_overlapping
 from tco.types import Cameras, Views
 
@@ -86,7 +87,7 @@ def settled(
             taken[i] = torch.from_numpy(found != maps[i])
             result[i] = torch.from_numpy(found).to(depth).where(taken[i], depth[i])
 
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+    with ThreadPoolExecutor(min(torch.get_num_threads(), WORKERS)) as pool:
         list(pool.map(settle_one, views.wanted))
     return result, taken
 
@@ -103,7 +104,7 @@ def _settled(
     poses = np.stack([_pose(cameras, j, i) for j in others])
     rules = Rules(SAME, BEYOND, LEAST, BEHIND, WORTH, MARGIN, BEST, _window(), CONTRAST, NOISE, SHOWN)
     out = np.empty_like(maps[i])
-    settle(View(maps[i], grey[i], told), Others(maps[others], grey[others], poses), rules, out)
+    settle(View(maps[i], grey[i], told), Others(maps, grey, np.array(others), poses), rules, out)
     return out
 
 
