@@ -94,16 +94,17 @@ def main() -> None:
         real = load(name, args.size, args.views)
         config = TCOConfig(steps=args.steps)
         outcome = optimize(network, real.views, real.given, config)
-        together = concluded(outcome, real.views, real.given, config).agreement
-        prediction, known = together.prediction, real.truth > 0
-        error = (prediction.depth / real.truth.clamp_min(1e-6) - 1).abs()[known].clamp_max(0.5)
+        end = concluded(outcome, real.views, real.given, config)
+        prediction, known = end.agreement.prediction, real.truth > 0
+        error = (prediction.depth / real.truth.clamp_min(1e-6) - 1).abs().double().clamp_max(0.5)
         predicted = (ERROR_UNIT / (prediction.confidence[known] - 1).clamp_min(1e-3)).to(torch.float64)
-        curves[name] = classes(predicted.numpy(), error.to(torch.float64).numpy())
-        spread = together.error[known].to(torch.float64).numpy()
-        apart[name] = classes(spread, error.to(torch.float64).numpy(), APART)
+        curves[name] = classes(predicted.numpy(), error[known].numpy())
+        own = known & ~end.taken
+        apart[name] = classes(end.agreement.error[own].double().numpy(), error[own].numpy(), APART)
     text = "# Calibration of the confidence\n\n" + paragraph(
         f"`python -m benchmarks.calibration --steps {args.steps}`: {weights_told(weights)}, {args.size} "
-        f"pixels, {args.views or 'all'} views."
+        f"pixels, {args.views or 'all'} views. Standard errors are of pixels that have not taken another "
+        "view's depth; their share is of these."
     )
     if args.output is not None:
         picture = plot_beside(args.output, args.part)

@@ -2,8 +2,8 @@
 
     python -m benchmarks.hints [--output docs/hints.md]
 
-Every row is the whole of what the maps are made by: optimisation, consensus, planes. Random scenes are those
-of ``benchmarks.planes``.
+Every row is the whole of what the maps are made by: optimisation, consensus, planes, contest. Random scenes
+are those of ``benchmarks.planes``.
 """
 
 from __future__ import annotations

@@ -83,7 +83,7 @@ def cases(args: argparse.Namespace) -> Iterator[Case]:
 
     def predicted(name: str, views: Views, priors: Priors, truth: Tensor, config: TCOConfig) -> Case:
         outcome = optimize(network, views, priors, config)
-        plain = replace(config, consensus=replace(config.consensus, planes=0))
+        plain = replace(config, consensus=replace(config.consensus, planes=0, contest_views=0))
         together = concluded(outcome, views, priors, plain).flat.before
         assert priors.overlap is not None
         return Case(name, together, outcome.cameras, views, priors.overlap, truth)

@@ -32,12 +32,12 @@ LEGEND = (
     f"Pictures of {NETWORKS['sweep'].image_size} pixels unless an option says otherwise. PatchMatch is a "
     "CPU implementation at half the resolution of the pictures (`score.py --baseline patchmatch "
     "--half`). Depth figures are of the maps as written, after the views were asked together "
-    "(`docs/consensus.md` has them of each view alone) and put on planes (`docs/planes.md` has them "
-    "without); clouds are made of what each view found alone, and of the other in their gaps. cover: "
-    "share of the measured pixels with a depth. med: median relative error. d2, d5: share of **all** "
-    "measured pixels within 2 and 5 %; a hole counts as wrong. f5: F-score of the cloud at 5 cm; acc, "
-    "comp: median distance of its points to the truth, and of the truth to it, in metres. s: seconds of "
-    "the whole command, from starting Python to the page of the report."
+    "(`docs/consensus.md` has them of each view alone), put on planes (`docs/planes.md` has them "
+    "without) and contested (`docs/contest.md`); clouds are made of what each view found alone, and of "
+    "the other in their gaps. cover: share of the measured pixels with a depth. med: median relative "
+    "error. d2, d5: share of **all** measured pixels within 2 and 5 %; a hole counts as wrong. f5: F-score "
+    "of the cloud at 5 cm; acc, comp: median distance of its points to the truth, and of the truth to it, "
+    "in metres. s: seconds of the whole command, from starting Python to the page of the report."
 )
 """What the table says of itself."""
 

@@ -77,7 +77,10 @@ class Scene:
         config: ConsensusConfig = ConsensusConfig(),
         seed: int = 0,
     ) -> Agreement:
-        """What the V views say together of the depths, planes among them: what ``densify`` writes as maps.
+        """What the V views say together of the depths, on planes and after their contest.
+
+        ``densify`` writes the same as maps, but for what it takes back of refined depths where they were made
+        worse (:func:`tco.conclusion.concluded`, which needs the whole ``Outcome``).
 
         Args:
             prediction: of all V views, each by itself.
@@ -85,11 +88,13 @@ class Scene:
             config: settings.
             seed: of the planes that are drawn.
         """
-        from tco.planar.run import together
+        from tco.conclusion import finished
+        from tco.consensus import agreed
 
         cameras = cameras or self.priors.cameras
         assert cameras is not None
-        return together(prediction, cameras, self.views, self.priors, config, seed).agreement
+        agreement = agreed(prediction, cameras, self.views, self.priors, config)
+        return finished(agreement, prediction, cameras, self.views, self.priors, config, seed).agreement
 
     def fuse(
         self,

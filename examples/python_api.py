@@ -52,7 +52,8 @@ def reconstruct(root: Path, size: int, config: TCOConfig) -> tuple[Cloud, dict[s
     # Test-time optimisation. The network is as before when this returns; steps=0 would leave it alone.
     outcome = optimize(network, views, priors.optimise, config)
 
-    # Consensus: each pixel's depth by what all views that see the place say of it; then planes among these.
+    # Consensus: each pixel's depth by what all views that see the place say of it; planes among these; then
+    # depths that others contradict give way.
     agreement = concluded(outcome, views, priors.optimise, config).agreement
     errors = torch.cat(errors_at_points(agreement.prediction, priors.held_out))
 

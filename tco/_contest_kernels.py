@@ -1,8 +1,8 @@
 """Compiled loops of :mod:`tco.contest`: depths of one view carried into another, and what they are worth.
 
 Most pixels are not contested and cost a look at what the others put there; what is left is so little that a
-plain loop over pixels, depths and views will do. All of it is inlined: what is called could be linked in
-another form when it is read from disk than when it was compiled, and round otherwise.
+plain loop over pixels, depths and views will do, which sums in order. All of it is inlined: what is called
+could be linked in another form when it is read from disk than when it was compiled, and round otherwise.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float32]
 f32 = np.float32
 ZERO, HALF, ONE = f32(0.0), f32(0.5), f32(1.0)
-FAST = {"reassoc", "contract", "nsz", "arcp"}  # sums in any order, but what is not finite stays so
 FRONT, OUTSIDE = f32(1e-6), f32(-9.0)
 """Depth from which on something is in front of a camera; place of what is not."""
 
@@ -82,7 +81,7 @@ class Rules(NamedTuple):
     shown: float
 
 
-@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
 def _place(pose: Floats, column: Any, row: Any, d: Any) -> tuple[Any, Any, Any]:
     """Where a pixel of a depth falls in another view: column and row, centres at +0.5, and depth."""
     a, b = f32(column) + HALF, f32(row) + HALF
@@ -94,7 +93,7 @@ def _place(pose: Floats, column: Any, row: Any, d: Any) -> tuple[Any, Any, Any]:
     return u, v, z
 
 
-@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def carry(depth: Floats, pose: Floats, radius: float, out: Floats) -> None:
     """Put the depths of one view into another: the nearest at each pixel.
 
@@ -122,7 +121,7 @@ def carry(depth: Floats, pose: Floats, radius: float, out: Floats) -> None:
                         out[row, column] = z
 
 
-@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
 def _votes(view: View, others: Others, rules: Rules, at: tuple[int, int], d: Any) -> tuple[Any, Any]:
     """How many other views agree with a depth of a pixel (row, column), and that less those that object."""
     y, x = at
@@ -143,7 +142,7 @@ def _votes(view: View, others: Others, rules: Rules, at: tuple[int, int], d: Any
     return agree, agree - against
 
 
-@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
 def _window(view: View, rules: Rules, at: tuple[int, int], into: Floats) -> None:
     """Grey of the pixels around one, above its own, and their weight, (T, 2); 0 where there is none."""
     y, x = at
@@ -156,7 +155,7 @@ def _window(view: View, rules: Rules, at: tuple[int, int], into: Floats) -> None
             into[t, 1] = rules.window[t, 2] * f32(math.exp(-abs(into[t, 0]) / f32(rules.contrast)))
 
 
-@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
 def _look_up(grey: Floats, u: Any, v: Any) -> Any:
     """Grey between four pixels, below 0 if one of them does not count; pixel centres at +0.5."""
     h, w = grey.shape
@@ -172,7 +171,7 @@ def _look_up(grey: Floats, u: Any, v: Any) -> Any:
     return (a * (ONE - fx) + b * fx) * (ONE - fy) + (c * (ONE - fx) + d * fx) * fy
 
 
-@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
 def _correlation(
     view: View, others: Others, s: int, rules: Rules, at: tuple[int, int], d: Any, window: Floats
 ) -> Any:
@@ -216,7 +215,7 @@ def _correlation(
     return (both / total - mine * theirs) / f32(math.sqrt(one * two))
 
 
-@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
 def _alike(
     view: View, others: Others, rules: Rules, at: tuple[int, int], d: Any, window: Floats, highest: Floats
 ) -> Any:
@@ -230,7 +229,7 @@ def _alike(
     return highest.mean()
 
 
-@njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
 def _contested(view: View, rules: Rules, at: tuple[int, int]) -> bool:
     """Whether any view puts something else at a pixel that has a depth."""
     d = view.depth[at]

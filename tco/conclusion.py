@@ -25,10 +25,10 @@ from torch import Tensor
 
 from tco.consensus import Agreement, agreed
 from tco.contest import settled
-from tco.options import TCOConfig
+from tco.options import ConsensusConfig, TCOConfig
 from tco.planar.run import OnPlanes, on_planes
 from tco.planar.view import SIDE
-from tco.types import Priors, Views
+from tco.types import Cameras, Prediction, Priors, Views
 
 if TYPE_CHECKING:
     from tco.optimize import Outcome
@@ -56,7 +56,7 @@ class Conclusion:
 
 
 def concluded(outcome: Outcome, views: Views, priors: Priors, config: TCOConfig, seed: int = 0) -> Conclusion:
-    """What the views say together, with refined depths or those of before, on planes where it is flat.
+    """What the views say together, with refined depths or those of before; then :func:`finished`.
 
     Args:
         outcome: of :func:`tco.optimize.optimize`.
@@ -70,20 +70,37 @@ def concluded(outcome: Outcome, views: Views, priors: Priors, config: TCOConfig,
     """
     prediction, cameras = outcome.prediction, outcome.cameras
     agreement = agreed(prediction, cameras, views, priors, config.consensus)
-    asked = agreement.prediction is not prediction
     growth = config.polish.polish_growth
-    if outcome.before is not None and growth > 0 and asked:
+    if outcome.before is not None and growth > 0 and agreement.prediction is not prediction:
         before = agreed(outcome.before, cameras, views, priors, config.consensus)
         keep = grown(before.error, agreement.error) <= growth
         depth = agreement.prediction.depth.where(keep, before.prediction.depth)
         error = agreement.error.where(keep, torch.maximum(agreement.error, before.error))
         agreement = Agreement(replace(agreement.prediction, depth=depth), error)
-    flat = on_planes(agreement, prediction, cameras, views, config.consensus, seed)
-    found = flat.agreement.prediction.depth
-    if not asked or priors.overlap is None:
-        return Conclusion(flat.agreement, flat, torch.zeros_like(found, dtype=torch.bool))
-    depth, taken = settled(found, cameras.to("cpu"), views.to("cpu"), priors.overlap, config.consensus)
-    error = flat.agreement.error
+    return finished(agreement, prediction, cameras, views, priors, config.consensus, seed)
+
+
+def finished(
+    agreement: Agreement, prediction: Prediction, cameras: Cameras, views: Views, priors: Priors,
+    config: ConsensusConfig, seed: int = 0,
+) -> Conclusion:  # fmt: skip
+    """What views agree on, put on planes and contested.
+
+    Args:
+        agreement: of all V views; neither is done if it is of the ``prediction`` itself, as nobody was asked.
+        prediction: of all V views, each by itself.
+        cameras: of all V views.
+        views: pictures, which pixels count, which views are wanted.
+        priors: whose ``overlap`` says which views overlap best.
+        config: settings.
+        seed: of the planes that are drawn.
+    """
+    flat = on_planes(agreement, prediction, cameras, views, config, seed)
+    if agreement.prediction is prediction:
+        return Conclusion(flat.agreement, flat, torch.zeros_like(flat.labels, dtype=torch.bool))
+    assert priors.overlap is not None
+    found, error = flat.agreement.prediction.depth, flat.agreement.error
+    depth, taken = settled(found, cameras.to("cpu"), views.to("cpu"), priors.overlap, config)
     apart = (depth / found).log().abs().where(taken, torch.zeros_like(error))
     told = Agreement(replace(flat.agreement.prediction, depth=depth), torch.maximum(error, apart))
     return Conclusion(told, flat, taken)

@@ -105,9 +105,9 @@ def agreed(
     error = torch.full_like(prediction.depth, math.inf)
     if config.consensus_rounds == 0 or len(views) < 2:
         return Agreement(prediction, error)
-    consequence = "views are not asked for each other's depths, nor put on planes (--consensus_uncertainty)"
+    consequence = "views are not asked for each other's depths, nor these put on planes or contested"
     if priors.cameras is not None and too_uncertain(
-        priors, views.size, config.consensus_uncertainty, consequence
+        priors, views.size, config.consensus_uncertainty, f"{consequence} (--consensus_uncertainty)"
     ):
         return Agreement(prediction, error)
     known = torch.isfinite(prediction.depth) & (prediction.depth > 0)

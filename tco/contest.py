@@ -6,20 +6,20 @@ has other depths to choose from: each of the views that overlap best puts its ow
 that fall on the pixel. One that differs from the pixel's depth is weighed against it by
 
 - views: those whose depth at its place is the same, less those that see through it, to something beyond, less
-  those that put something before it, which would hide it from here. Counted so, what is in front and what is
-  behind are in balance at the right depth;
-- pictures: the mean of the highest correlations of a window around the pixel with other pictures, bilaterally
-  weighted; a correlation of one is worth ``WORTH`` views.
+  those that put something before it, which would hide it from here. A depth too near is seen through, one too
+  far is hidden; the right one is least of both;
+- pictures: the mean of the highest correlations of a window around the pixel with other pictures; a
+  correlation of one is worth ``WORTH`` views. One that shows less than ``SHOWN`` of the window has none.
 
-Either alone takes more good depths than it mends bad ones: views err together, and a window of a picture
-looks like others by chance. Depths of before planes are no better evidence for having been found
-independently of each other: planes mend more than views have in common.
+Both are needed (``docs/contest.md``): views err together, and a window looks like others by chance. The views
+are asked with their depths on planes: those of before count for more views that found them by themselves,
+which counts for less than what planes mend.
 
 What is taken here has been found before by others, which do not become more by that: it is for the maps that
-are written, not evidence for a fusion.
+are written, and no point of a cloud begins with it.
 
 Visibility: Merrell et al., Real-time visibility-based fusion of depth maps, ICCV 2007 (stability). Weights of
-the window: Schönberger et al., Pixelwise view selection for unstructured multi-view stereo, ECCV 2016.
+the window: Yoon and Kweon, Adaptive support-weight approach for correspondence search, PAMI 2006.
 """
 
 from __future__ import annotations
@@ -39,20 +39,24 @@ from tco.types import Cameras, Views
 SAME, BEYOND = 0.02, 0.05
 """Relative difference up to which two depths are one surface, and from which on one hides the other."""
 RADIUS = 0.35
-"""Pixels to each side that a pixel of another view covers, so that no gaps open between them."""
+"""Pixels to each side that a pixel of another view covers, so that no gaps open between them. The nearest of
+those that cover a pixel counts, so that what is in front grows by as much."""
 LEAST, BEHIND = 2.0, 2.0
-"""Views that must agree with a depth that is taken; votes by which it may have fewer."""
+"""Other views that must agree with a depth that is taken, with the one that put it there; votes by which it
+may have fewer than the pixel's own."""
 WORTH = 20.0
 """Views that a correlation of one is worth."""
 MARGIN = 2.0
 """Votes by which a depth must be worth more than the pixel's own."""
+MEMORY = 1 << 28
+"""Bytes at most of what is put into views, of all that are settled at once."""
 BEST = 3
 """Pictures whose correlations are taken, the highest: the others may not see the place."""
 SIDE = 2
 """Pixels to each side of the window."""
 CONTRAST, NOISE = 0.1, 1 / 12 / 255**2
 """Difference in grey, of 1, at which a pixel of the window counts 1 / e; variance that rounding to bytes
-gives."""
+gives where all channels are alike."""
 SHOWN = 0.6
 """Share of the window's weight that another picture must show to say something."""
 
@@ -77,8 +81,8 @@ def settled(
     if config.contest_views == 0 or len(views) < 2:
         return result, taken
     known = (torch.isfinite(depth) & (depth > 0) & views.valid).numpy()
-    maps = np.where(known, depth.numpy(), 0).astype(np.float32)
-    grey = views.images.float().mean(1).where(views.valid, torch.tensor(-1.0)).numpy()
+    maps = np.where(known, depth.numpy(), np.float32(0)).astype(np.float32, copy=False)
+    grey = views.images.float().mean(1).masked_fill_(~views.valid, -1.0).numpy()
 
     def settle_one(i: int) -> None:
         others = most_overlapping(overlap, i, config.contest_views)
@@ -87,7 +91,8 @@ def settled(
             taken[i] = torch.from_numpy(found != maps[i])
             result[i] = torch.from_numpy(found).to(depth).where(taken[i], depth[i])
 
-    with ThreadPoolExecutor(min(torch.get_num_threads(), WORKERS)) as pool:
+    at_once = max(1, MEMORY // (4 * config.contest_views * maps[0].size))
+    with ThreadPoolExecutor(min(torch.get_num_threads(), WORKERS, at_once)) as pool:
         list(pool.map(settle_one, views.wanted))
     return result, taken
 

@@ -118,7 +118,7 @@ class PolishConfig:
 
 @dataclass(frozen=True)
 class ConsensusConfig:
-    """What the views say together (``tco/consensus.py``), and the planes that they show (``tco/planar``).
+    """What views say together (``tco/consensus.py``), planes (``tco/planar``), contest (``tco/contest.py``).
 
     No optimisation, and without steps, too.
     """
@@ -126,7 +126,7 @@ class ConsensusConfig:
     consensus_rounds: int = knob(
         2,
         "times that each pixel's depth is moved to the weighted median of what the views say of it, each "
-        "with its own depths; 0: the depths of a view are its own alone, not on planes either",
+        "with its own depths; 0: the depths of a view are its own alone, not on planes nor contested either",
     )
     consensus_views: int = knob(20, "views that a pixel asks, those that overlap best")
     consensus_reach: float = knob(
@@ -147,7 +147,7 @@ class ConsensusConfig:
     contest_views: int = knob(
         8,
         "views that overlap best, whose depths a pixel may take instead of its own, where they and the "
-        "pictures say so; 0: none",
+        "pictures say so; two must agree with it; 0: none",
     )
     planes: int = knob(
         20,

@@ -102,10 +102,26 @@ def test_views_that_err_together_are_believed_where_pictures_show_nothing(scene:
     assert float((depth[2] / said[2]).log()[taken[2]].median()) > 0.15
 
 
-def test_pictures_outweigh_a_vote(scene: Wall) -> None:
-    """Two views right and two wrong: votes are even, and stay without pictures; with these the right win.
+def test_pictures_do_not_outweigh_more_than_two_votes(scene: Wall) -> None:
+    """Four of six are wrong alike: 1 + 3 − 2 votes, for the truth 2 − 3, whatever pictures say."""
+    said = 1.3 * scene.depth
+    said[[2, 3]] = scene.depth[[2, 3]]
+    taken = decided(scene, said)[1][[0, 1, 4, 5], 14:-14, 20:-20]
+    assert float(taken.float().mean()) < 0.02
 
-    Four views, so that each side has two: a view's own depth and one that agrees with it.
+
+def test_a_depth_takes_two_others(scene: Wall) -> None:
+    """Of two views neither can be told which is right."""
+    two = wall(2)
+    said = two.depth.clone()
+    said[1][PATCH] *= 1.3
+    assert not decided(two, said)[1].any()
+
+
+def test_pictures_decide_where_votes_are_near(scene: Wall) -> None:
+    """Two views right and two wrong: votes are within the margin; with pictures the wrong take the right.
+
+    Where both right ones see the place: at its borders one of them does not.
     """
     some = [0, 2, 3, 5]
     four = replace(scene.views, images=scene.views.images[some], valid=scene.views.valid[some])
@@ -116,12 +132,12 @@ def test_pictures_outweigh_a_vote(scene: Wall) -> None:
     nothing = replace(four, images=torch.full_like(four.images, 0.5))
     with_pictures, taken = settled(said, poses, four, shared, CONFIG)
     _, without = settled(said, poses, nothing, shared, CONFIG)
-    inner = (slice(None), slice(8, -8), slice(12, -12))
+    inner = (slice(None), slice(14, -14), slice(20, -20))
     right = ((with_pictures / scene.depth[some]).log().abs() < 0.01)[inner].float().mean((1, 2))
     assert float(without[inner].float().mean()) < 0.2
-    assert float(right[2:].min()) > 0.9
-    assert float(taken[:2][inner].float().mean()) > 0.25
-    assert bool(((right[:2]) > 0.25).all())
+    assert float(right[:2].min()) > 0.9
+    assert float(right[2:].min()) > 0.99
+    assert float(taken[:2][inner].float().mean()) > 0.9
 
 
 def scattered(scene: Wall, seed: int) -> Tensor:

@@ -13,6 +13,7 @@ import hashlib
 import torch
 from tco.backbones.weights import load_sweep
 from tco.consensus import agreed
+from tco.contest import settled
 from tco.objective import ObjectiveConfig
 from tco.options import ConsensusConfig
 from tco.toy import wall
@@ -31,7 +32,11 @@ loss = warped_difference(
     moved, torch.ones_like(moved), views, prediction.cameras, (0, [1, 2]), prediction, config
 )
 loss.backward()
-for x in (encoded.volume, depth, said.prediction.depth, said.error, loss, moved.grad):
+torn = depth.clone()
+torn[1, 20:60, 30:90] *= 1.3
+mended, taken = settled(torn, prediction.cameras, views, priors.overlap, ConsensusConfig())
+assert taken.sum() > 500
+for x in (encoded.volume, depth, said.prediction.depth, said.error, loss, moved.grad, mended):
     print(hashlib.sha256(x.detach().contiguous().numpy().tobytes()).hexdigest())
 """
 
@@ -47,5 +52,5 @@ def test_a_second_process_computes_the_same(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr
         told.append(done.stdout.split())
         kept.append(len(list(tmp_path.rglob("*.nbi"))))
-    assert kept[0] == kept[1] > 0 and len(told[0]) == 6
+    assert kept[0] == kept[1] > 0 and len(told[0]) == 7
     assert told[0] == told[1]
