@@ -311,7 +311,7 @@ MUTATIONS = [
         "tco/contest.py",
         "contest conclusion",
         ("(depth > 0) & views.valid)", "(depth > 0))"),
-        (".where(views.valid, torch.tensor(-1.0))", ""),
+        (".masked_fill_(~views.valid, -1.0)", ""),
         ("_pose(cameras, i, j), RADIUS", "_pose(cameras, j, i), RADIUS"),
         ("pool.map(settle_one, views.wanted)", "pool.map(settle_one, range(len(views)))"),
         ("-(row**2 + column**2) / (2 * SIDE**2)", "-(row**2 + column**2) / SIDE**2"),
@@ -325,7 +325,7 @@ MUTATIONS = [
         ("agreed(outcome.before,", "agreed(prediction,"),
         ("round(AROUND * side / SIDE)", "round(side / SIDE)"),
         ("torch.maximum(error, apart)", "error"),
-        ("if not asked or priors.overlap is None:", "if priors.overlap is None:"),
+        ("if agreement.prediction is prediction:", "if False:"),
     ),
     *_of(
         "tco/planar/_kernels.py",

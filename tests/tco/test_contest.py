@@ -298,7 +298,7 @@ def test_threads_change_nothing(scene: Wall, threads: int) -> None:
     assert torch.equal(many.nan_to_num(), decided(scene, said)[0].nan_to_num())
 
 
-def test_a_shifted_wall_is_carried_by_its_disparity() -> None:
+def test_a_shifted_wall_is_carried_by_its_parallax() -> None:
     """A camera moved by b to the right sees depth z f b / z pixels to the left; f b / z is 3 here."""
     f, z = 40.0, 2.0
     K = torch.tensor([[f, 0, 16], [0, f, 12], [0, 0, 1]]).repeat(2, 1, 1)
