@@ -84,7 +84,7 @@ def main() -> None:
     """Measure and publish."""
     args = parser().parse_args()
     every = list(map(on_planes, cases(args)))
-    shares(every[0], 1, {})  # compiles the loops
+    shares(every[0], 2, {})  # compiles the loops
     named, random = every[: len(args.sets)], every[len(args.sets) :]
     text = "# Contested depths\n\n" + paragraph(
         f"`python -m benchmarks.contest`: {weights_told(args.weights or EMBEDDED)}, {args.size} pixels, "

@@ -91,7 +91,7 @@ def settled(
             taken[i] = torch.from_numpy(found != maps[i])
             result[i] = torch.from_numpy(found).to(depth).where(taken[i], depth[i])
 
-    at_once = max(1, MEMORY // (4 * config.contest_views * maps[0].size))
+    at_once = max(1, MEMORY // (4 * min(config.contest_views, len(views) - 1) * maps[0].size))
     with ThreadPoolExecutor(min(torch.get_num_threads(), WORKERS, at_once)) as pool:
         list(pool.map(settle_one, views.wanted))
     return result, taken

@@ -185,10 +185,10 @@ class ConsensusConfig:
         if self.plane_trust <= 0:
             raise ValueError("plane_trust must be positive")
         check_range(self, "plane_smoothness plane_square plane_colour", 0)
-        if self.consensus_rounds < 0 or self.consensus_views < 1 or self.contest_views < 0:
-            raise ValueError(
-                "consensus_rounds and contest_views must not be negative, and consensus_views at least 1"
-            )
+        if self.consensus_rounds < 0 or self.consensus_views < 1:
+            raise ValueError("consensus_rounds must not be negative, and consensus_views at least 1")
+        if self.contest_views < 0 or self.contest_views == 1:
+            raise ValueError("contest_views must be 0, or at least 2: two views must agree with a depth")
         if not (self.consensus_reach > 0 and self.consensus_width > 0):
             raise ValueError("consensus_reach and consensus_width must be positive")
         if self.consensus_uncertainty < 0:

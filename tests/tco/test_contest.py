@@ -288,6 +288,12 @@ def test_nobody_is_asked_by_none(scene: Wall) -> None:
     assert not taken.any()
 
 
+@pytest.mark.parametrize("views", [-1, 1])
+def test_a_number_of_views_that_can_do_nothing_is_refused(views: int) -> None:
+    with pytest.raises(ValueError, match="contest_views must be 0, or at least 2"):
+        ConsensusConfig(contest_views=views)
+
+
 @pytest.mark.parametrize("threads", [1, 3])
 def test_threads_change_nothing(scene: Wall, threads: int) -> None:
     before, said = torch.get_num_threads(), scattered(scene, 3)
