@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from tco.backbones.layers import Block, Conv, Pointwise, Residual, rotary
+from tco.backbones.layers import Block, Conv, Pointwise, Residual, ScoreConv3d, rotary
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Volume(nn.Module):
         self.up2, self.up1, self.up0 = Pointwise(64, 48), Pointwise(48, 32), Pointwise(32, 16)
         self.out2, self.out1, self.out0 = Conv(3, 48, 48), Conv(3, 32, 32), Conv(3, 16, 16)
         self.last = Gate(self.CONTEXT[0], 16)
-        self.head = nn.Conv3d(16, 1, 3, padding=1)
+        self.head = ScoreConv3d(16)
 
     def forward(self, volume: Tensor, context: tuple[Tensor, Tensor, Tensor]) -> Tensor:
         """Scores (B, D, h, w) of the planes.

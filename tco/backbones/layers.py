@@ -7,6 +7,47 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 
+class Conv3d(nn.Conv3d):
+    """PyTorch's, and as fast for one small volume in float32 on a CPU as for several.
+
+    PyTorch computes that by a loop of its own, several times as slow as oneDNN, which it asks for all else
+    (2.13). Where no gradient is recorded oneDNN is asked here.
+    """
+
+    def _conv_forward(self, input: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+        recorded = torch.is_grad_enabled() and (input.requires_grad or weight.requires_grad)
+        if len(input) > 1 or recorded or not (_in_float32(input) and torch.backends.mkldnn.is_available()):
+            return super()._conv_forward(input, weight, bias)
+        padding = [int(p) for p in self.padding]
+        return torch.mkldnn_convolution(input, weight, bias, padding, self.stride, self.dilation, self.groups)
+
+
+class ScoreConv3d(Conv3d):
+    """A 3×3×3 convolution with one output channel, in float32 on a CPU in a third of the time.
+
+    A CPU computes eight output channels at once, so that most of the work for one is lost. The kernel's three
+    slices along the first axis are three channels of a convolution within planes, which are then added, each
+    shifted by a plane.
+    """
+
+    def __init__(self, cin: int) -> None:
+        super().__init__(cin, 1, 3, padding=1)
+
+    def _conv_forward(self, input: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+        if not _in_float32(input):
+            return super()._conv_forward(input, weight, bias)
+        within = F.conv3d(input, weight.permute(2, 1, 0, 3, 4), padding=(0, 1, 1))
+        before, here, after = F.pad(within, (0, 0, 0, 0, 1, 1)).split(1, 1)
+        planes = input.shape[2]
+        total = before[:, :, :planes] + here[:, :, 1:-1] + after[:, :, 2:]
+        return total if bias is None else total + bias
+
+
+def _in_float32(x: Tensor) -> bool:
+    """Whether products with it are computed in float32 on a CPU."""
+    return x.device.type == "cpu" and x.dtype == torch.float32 and not torch.is_autocast_enabled("cpu")
+
+
 class Conv(nn.Module):
     """Convolution in two or three dimensions, group normalisation, ReLU."""
 
@@ -14,7 +55,7 @@ class Conv(nn.Module):
         self, dims: int, cin: int, cout: int, kernel: int = 3, stride: int = 1, dilation: int = 1
     ) -> None:
         super().__init__()
-        kind = nn.Conv2d if dims == 2 else nn.Conv3d
+        kind = nn.Conv2d if dims == 2 else Conv3d
         self.conv = kind(cin, cout, kernel, stride, dilation * (kernel // 2), dilation, bias=False)
         self.norm = nn.GroupNorm(max(1, cout // 8), cout)
 
@@ -42,7 +83,7 @@ class Residual(nn.Module):
     def __init__(self, dims: int, channels: int, dilation: int = 1) -> None:
         super().__init__()
         self.a = Conv(dims, channels, channels, dilation=dilation)
-        kind = nn.Conv2d if dims == 2 else nn.Conv3d
+        kind = nn.Conv2d if dims == 2 else Conv3d
         self.b = kind(channels, channels, 3, padding=1)
         for parameter in self.b.parameters():
             nn.init.zeros_(parameter)
