@@ -141,7 +141,8 @@ def main() -> None:
         "| set | method | " + " | ".join(COLUMNS) + " | s | s / view | GiB |\n" + "|---" * (len(COLUMNS) + 5)
     )
     chosen = [] if args.sets == list(SETS) else ["--sets", *args.sets]
-    told = " ".join([*chosen, "--steps", *map(str, args.steps), *rest])
+    beside = [] if args.baselines == ["interp"] else ["--baselines", *args.baselines]
+    told = " ".join([*chosen, *beside, "--steps", *map(str, args.steps), *rest])
     made = f"`python -m benchmarks.quality {told}`: {weights_told(located(NETWORKS['sweep']))}."
     about = paragraph(f"{made} {LEGEND}" if args.part == FIRST else made)
     text = f"# Quality, measured\n\n{about}\n{head}|\n"
