@@ -43,6 +43,14 @@ MUTATIONS = [
         ("(3, 1, 1), 1, (1, 0, 0)).squeeze", "(1, 1, 1), 1, (0, 0, 0)).squeeze"),
     ),
     *_of(
+        "tco/backbones/layers.py",
+        "layers",
+        ("self.stride, self.dilation, self.groups", "self.stride, self.padding, self.groups"),
+        ("before[:, :, :planes] + here", "before[:, :, 2:] + here"),
+        ("weight.permute(2, 1, 0, 3, 4)", "weight.permute(3, 1, 0, 2, 4)"),
+        ("and not torch.is_autocast_enabled", "or torch.is_autocast_enabled"),
+    ),
+    *_of(
         "tco/backbones/prefix.py",
         "prefix",
         ("return start + min(", "return start + max("),

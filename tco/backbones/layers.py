@@ -11,12 +11,11 @@ class Conv3d(nn.Conv3d):
     """PyTorch's, and as fast for one small volume in float32 on a CPU as for several.
 
     PyTorch computes that by a loop of its own, several times as slow as oneDNN, which it asks for all else
-    (2.13). Where no gradient is recorded oneDNN is asked here.
+    (2.13). Here oneDNN is asked for it, too.
     """
 
     def _conv_forward(self, input: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-        recorded = torch.is_grad_enabled() and (input.requires_grad or weight.requires_grad)
-        if len(input) > 1 or recorded or not (_in_float32(input) and torch.backends.mkldnn.is_available()):
+        if len(input) > 1 or not (_in_float32(input) and torch.backends.mkldnn.is_available()):
             return super()._conv_forward(input, weight, bias)
         padding = [int(p) for p in self.padding]
         return torch.mkldnn_convolution(input, weight, bias, padding, self.stride, self.dilation, self.groups)
