@@ -12,9 +12,9 @@ once the network is there, on CUDA that of PyTorch's allocator.
 Published networks are too large to be measured at many sizes. Their own tensors are counted
 (:mod:`benchmarks.counting`) for the kind of device that ``--device`` names, which need not be there, and
 added to what everything else takes, which is measured with a network of three numbers, ``pipeline``;
-``--check`` measures the sum. Their matrix products are in the type that ``--dtype`` names, which a CPU
-without bfloat16 would run in float32. The mode ``recomputed`` is ``optimised`` with activations computed
-again.
+``--check`` measures the sum. Products are in the type that ``--dtype`` names; bfloat16 is to be measured on a
+device that has it, since another computes it by way of float32. The mode ``recomputed`` is ``optimised`` with
+activations computed again.
 """
 
 from __future__ import annotations
@@ -40,7 +40,10 @@ Size = tuple[int, int, int]
 PIPELINE = "pipeline"
 COUNTED = ("vggt", "pi3", "mini", "da3", "da3-small")
 FITTED: dict[str, tuple[Size, ...]] = {
-    "sweep": ((4, 128, 96), (4, 256, 192), (15, 256, 192), (4, 512, 384), (15, 512, 384), (60, 256, 192)),
+    "sweep": (
+        *((4, 128, 96), (4, 256, 192), (15, 256, 192), (15, 320, 240), (4, 512, 384), (15, 512, 384)),
+        (60, 256, 192),
+    ),
     PIPELINE: ((4, 128, 96), (12, 256, 192), (4, 512, 384)),
     **dict.fromkeys(("vggt", "pi3"), ((2, 280, 210), (4, 518, 392), (12, 518, 392))),
     "mini": ((2, 256, 192), (4, 256, 192), (4, 512, 384)),
@@ -172,7 +175,7 @@ def with_weights(fit: tuple[float, float, float], weights: float) -> tuple[float
 
 def where(network: str, place: tuple[str, str]) -> str:
     """Device, and the type of the products for the networks that can be told it."""
-    return ":".join(place) if network in COUNTED else place[0]
+    return ":".join(place) if network in ("sweep", *COUNTED) else place[0]
 
 
 def show(key: tuple[str, str, str], asked: Size, peak: Peak, guess: float) -> None:
@@ -223,7 +226,7 @@ def source(process: float, fits: Fits, counts: Fits) -> str:
             f"PROCESS = {number(process)}",
             '"""Bytes of a process that has imported everything and loaded no network."""\n',
             *table("FITS", fits),
-            f'"""Measured: (network, device, forward or optimised) → {rows}"""\n',
+            f'"""Measured: (network, device[:products], mode) → {rows}"""\n',
             *table("COUNTS", counts),
             f'"""Counted: (network, device:products, mode) → the same, beside that of {PIPELINE}."""\n',
         ]
@@ -289,7 +292,7 @@ def made(network: str, device: Any, dtype: Any) -> Any:
     from tco.toy import Toy
 
     if network == "sweep":
-        return load_sweep(device=device)
+        return load_sweep(device=device, dtype=dtype)
     if network == PIPELINE:
         return Toy().to(device)
     return random(network, dtype).to(device)

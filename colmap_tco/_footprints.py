@@ -6,10 +6,12 @@ PROCESS = 4.110e08
 FITS: dict[tuple[str, str, str], tuple[float, float, float]] = {
     ("pipeline", "cpu", "forward"): (5.048e08, 87.0, 170.7),
     ("pipeline", "cpu", "optimised"): (4.967e08, 180.5, 3079.4),
-    ("sweep", "cpu", "forward"): (5.597e08, 603.9, 1415.5),
-    ("sweep", "cpu", "optimised"): (6.363e08, 389.9, 6426.1),
+    ("sweep", "cpu:bfloat16", "forward"): (5.597e08, 603.9, 1415.5),
+    ("sweep", "cpu:bfloat16", "optimised"): (6.363e08, 389.9, 6426.1),
+    ("sweep", "cpu:float32", "forward"): (5.837e08, 446.8, 2460.3),
+    ("sweep", "cpu:float32", "optimised"): (6.690e08, 411.5, 8181.2),
 }
-"""Measured: (network, device, forward or optimised) → bytes fixed, bytes a pixel and view, bytes a pixel."""
+"""Measured: (network, device[:products], mode) → bytes fixed, bytes a pixel and view, bytes a pixel."""
 
 COUNTS: dict[tuple[str, str, str], tuple[float, float, float]] = {
     ("da3", "cpu:bfloat16", "forward"): (3.714e08, 824.4, 253.7),

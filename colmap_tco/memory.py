@@ -73,22 +73,25 @@ def footprint(
             published networks are counted as they are on a CPU and on CUDA.
             The type in which a device multiplies matrices counts: bfloat16 takes half of float32.
         steps: of optimisation; 0 takes less.
-        dtype: of the products of published networks, if it is not that in which the device takes them.
+        dtype: of the products, if it is not that in which the device takes them.
         recompute: whether activations are computed again in the backward pass, by networks that can.
 
     Where adapters change the last blocks alone, less is needed than this says: it is of adapters on all.
     """
     kind, mode = network.removesuffix("-commercial"), "optimised" if steps else "forward"
-    where = f"{'cuda' if device == 'cuda' else 'cpu'}:{dtype or _products(device)}"
+    products = dtype or _products(device)
+    where = f"{'cuda' if device == 'cuda' else 'cpu'}:{products}"
     counts = _footprints.COUNTS.get((kind, where, "recomputed" if steps and recompute else mode))
     measured = kind if counts is None else PIPELINE
-    place = device if (measured, device, mode) in _footprints.FITS else "cpu"
+    places = (f"{device}:{products}", device, f"cpu:{products}", "cpu")
+    place = next(p for p in places if (measured, p, mode) in _footprints.FITS)
     fixed, per_view, per_step = _footprints.FITS[measured, place, mode]
-    if place != device:
+    here = place.partition(":")[0] == device
+    if not here:
         fixed = max(0.0, fixed - _footprints.PROCESS)
     more = counts or (0.0, 0.0, 0.0)
     return Footprint(
-        fixed + more[0], per_view + more[1], per_step + more[2], place if place == device else "",
+        fixed + more[0], per_view + more[1], per_step + more[2], device if here else "",
         footprint(network, device, 0, dtype) if steps else None,
     )  # fmt: skip
 

@@ -94,9 +94,13 @@ def test_every_network_has_a_footprint(name: str, steps: int) -> None:
 def test_footprints_are_those_of_the_tables() -> None:
     """Measured where the network could be; else its own tensors beside what all the rest takes."""
     for mode, steps in (("forward", 0), ("optimised", 40)):
-        found = footprint("sweep", "cpu", steps)
-        assert (found.fixed, found.per_view, found.per_step) == FITS["sweep", "cpu", mode]
-        assert found.measured == "cpu"
+        for dtype in ("bfloat16", "float32"):
+            found = footprint("sweep", "cpu", steps, dtype)
+            assert (found.fixed, found.per_view, found.per_step) == FITS["sweep", f"cpu:{dtype}", mode]
+            assert found.measured == "cpu"
+            there = footprint("sweep", "cuda", steps, dtype)
+            assert (there.fixed + PROCESS, there.per_view) == (found.fixed, found.per_view)
+            assert not there.measured
         for (name, where, of), counts in COUNTS.items():
             if (of != "forward") != bool(steps):
                 continue
@@ -111,8 +115,9 @@ def test_footprints_are_those_of_the_tables() -> None:
 
 
 def test_bfloat16_takes_less_than_float32() -> None:
-    for name in ("vggt", "pi3", "da3", "da3-small"):
-        for steps in (0, 40):
+    """Of the embedded network's prediction by itself little is in either."""
+    for name in ("vggt", "pi3", "da3", "da3-small", "sweep"):
+        for steps in (40,) if name == "sweep" else (0, 40):
             half, whole = (footprint(name, "cpu", steps, dtype) for dtype in ("bfloat16", "float32"))
             assert half.bytes(10, 200_000) < whole.bytes(10, 200_000) < 2 * half.bytes(10, 200_000)
 
