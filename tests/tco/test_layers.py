@@ -16,7 +16,7 @@ from tco.lora import LoRAConfig, adapted
 MADE: dict[str, Callable[[], nn.Conv3d]] = {
     "small": lambda: Conv3d(5, 6, 3, padding=1, bias=False),
     "strided": lambda: Conv3d(5, 6, 3, stride=2, padding=1),
-    "dilated": lambda: Conv3d(5, 6, 3, padding=2, dilation=2),
+    "dilated": lambda: Conv3d(5, 6, 3, padding=1, dilation=2),
     "score": lambda: ScoreConv3d(5),
 }
 
