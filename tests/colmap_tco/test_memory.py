@@ -115,7 +115,7 @@ def test_footprints_are_those_of_the_tables() -> None:
 
 
 def test_bfloat16_takes_less_than_float32() -> None:
-    """Of the embedded network's prediction by itself little is in either."""
+    """What the embedded network keeps of a view is mostly float32 in both; steps hold products, too."""
     for name in ("vggt", "pi3", "da3", "da3-small", "sweep"):
         for steps in (40,) if name == "sweep" else (0, 40):
             half, whole = (footprint(name, "cpu", steps, dtype) for dtype in ("bfloat16", "float32"))
